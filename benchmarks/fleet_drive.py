@@ -4,8 +4,6 @@ The default estimators on the shipped car with its network, and on the default s
 Then all estimators, and further outputs: tracks, and with ``full`` the recording, annotated copy and page.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace

@@ -3,8 +3,6 @@
 Each command runs once, in a new process, with code compiled before, start included.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from benchmarks.measuring import CACHE, Row, command_cost

@@ -4,8 +4,6 @@ Processor seconds (user + system) of a single-threaded way and the best of inter
 on a machine that others use too.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -45,13 +43,6 @@ class Row:
     sense: str = "at most"
     peers: Mapping[str, float] = field(default_factory=dict)
     command: str = ""
-
-    @property
-    def passed(self) -> bool | None:
-        """Whether the target is met; None without one."""
-        if self.target is None:
-            return None
-        return self.value <= self.target if self.sense == "at most" else self.value >= self.target
 
 
 def best_seconds(ways: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:

@@ -5,8 +5,6 @@ noise, which nobody maps, in chunks that images and sensors share, as recorders 
 a log of the same length without images.
 """
 
-from __future__ import annotations
-
 import heapq
 import subprocess
 import sys

@@ -5,8 +5,6 @@ decompresses every chunk and checks its CRC. The peer decodes a tenth of the hou
 shared chunks has 150 MB of them in a minute; `inspect` of it includes the start of the process.
 """
 
-from __future__ import annotations
-
 import sys
 import zlib
 from contextlib import closing

@@ -4,8 +4,6 @@ The file has two channel groups of 360,000 samples and 12 channels in deflated b
 get all columns and times; ours cleans the times and reads in windows of a minute, as a run does.
 """
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

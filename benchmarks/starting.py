@@ -3,8 +3,6 @@
 A run of a 10 s log, with code compiled before: metrics only, and all outputs.
 """
 
-from __future__ import annotations
-
 from benchmarks.measuring import CACHE, ROOT, ROUNDS, Row, command_cost
 
 _RUN = ("run", ROOT / "sample_logs" / "dlc.mcap", "--car", "saloon", "-o", CACHE / "start")

@@ -4,8 +4,6 @@ Processor and elapsed seconds are the best of two turns, memory the smallest pea
 The last column: cost of the earlier version over that of this one.
 """
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 
@@ -19,19 +17,6 @@ TURNS = 2
 _FLEET = ("--car", "saloon", "--keep", "metrics", "--no-report")
 
 
-def works() -> dict[str, tuple[str | Path, ...]]:
-    """Return the words of each command."""
-    out = CACHE / "versions"
-    return {
-        "a new process runs 10 s, figures": LIGHT,
-        "inspect 60 s with 150 MB of images in shared chunks": ("inspect", image_log(SHARED_S)),
-        "inspect the hour": ("inspect", drive_log()),
-        f"{DRIVES} drives of a fleet": ("run", *drives(), *_FLEET, "-o", out),
-        "run of the hour, light outputs": run_words(out, light=True),
-        "run of the hour, everything": run_words(out, light=False),
-    }
-
-
 def rows(other: Path) -> list[Row]:
     """Measure this tree and another one."""
     commit = subprocess.run(
@@ -39,8 +24,16 @@ def rows(other: Path) -> list[Row]:
     ).stdout.strip()
     for tree in (ROOT, other):
         command_cost("compile", tree=tree)
-    measured = []
-    for work, words in works().items():
+    out, measured = CACHE / "versions", []
+    works: dict[str, tuple[str | Path, ...]] = {
+        "a new process runs 10 s, figures": LIGHT,
+        "inspect 60 s with 150 MB of images in shared chunks": ("inspect", image_log(SHARED_S)),
+        "inspect the hour": ("inspect", drive_log()),
+        f"{DRIVES} drives of a fleet": ("run", *drives(), *_FLEET, "-o", out),
+        "run of the hour, light outputs": run_words(out, light=True),
+        "run of the hour, everything": run_words(out, light=False),
+    }
+    for work, words in works.items():
         costs: dict[Path, list[Cost]] = {ROOT: [], other: []}
         for _ in range(TURNS):
             for tree, of_tree in costs.items():

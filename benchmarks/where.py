@@ -4,8 +4,6 @@ At each tick of the processor clock, the time since the last one counts for the 
 is running, or as start while a module is loaded.
 """
 
-from __future__ import annotations
-
 import json
 import signal
 import sys

@@ -7,13 +7,11 @@ error of a factor 0.5 to 2 at each axle; inertia, roll gradient, IMU position an
 prior of the calibration expects. All drives run by ``pdhef run`` with both files, with and without calibration.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -23,9 +21,10 @@ import polars as pl
 
 from pdhef_logtool import Car, PdhefError
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
+from pdhef_logtool.records.signals import FloatArray
 from studies.drawn_cars import KINDS, draw_car
 from studies.gates.tool import Tool, metrics, reports
-from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, number, options, table, update, write_toml, write_validated_car
+from studies.pages import ROOT, SAMPLE_VEHICLE, blocks, options, update, write_toml, write_validated_car
 from truthsim.batch import sensor_noise
 from truthsim.drive import simulate_drive
 from truthsim.vehicle import GRAVITY_M_S2
@@ -157,49 +156,33 @@ def figures_of(run: Path, log: str) -> Iterator[dict[str, Any]]:
 # ------------------------------------------------------------------------------------------------ tables
 
 
-def by_manoeuvre(runs: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
-    """Yield the runs of each manoeuvre, and all."""
-    for (name,), some in runs.group_by("drive", maintain_order=True):
-        yield str(name), some
-    yield "all", runs
+#: Columns of the errors: vehicle file, whether it is calibrated, estimator.
+COLUMNS = (
+    *((file, False, name) for file in (RIGHT, WRONG_FILE) for name in ("phy-ukf", "physics")),
+    (WRONG_FILE, True, "physics"), (RIGHT, True, "physics"),
+)  # fmt: skip
 
 
-def error_table(runs: pl.DataFrame) -> str:
-    """Return the median errors, a line a manoeuvre."""
-    columns = {
-        f"{file} file{', calibrated' if is_calibrated else ''}: {name}":
-            {"file": file, "calibrated": is_calibrated, "estimator": name}
-        for file, is_calibrated, names in (
-            (RIGHT, False, ("phy-ukf", "physics")), (WRONG_FILE, False, ("phy-ukf", "physics")),
-            (WRONG_FILE, True, ("physics",)), (RIGHT, True, ("physics",)),
-        )
-        for name in names
-    }  # fmt: skip
-    body = []
-    for manoeuvre, some in by_manoeuvre(runs):
-        rmse = {title: some.filter(**of)["rmse"].to_numpy() for title, of in columns.items()}
-        ratio = rmse["wrong file, calibrated: physics"] / rmse["right file: physics"]
-        low, middle, high = np.percentile(ratio, [10, 50, 90])
-        refused = some.filter(file=WRONG_FILE, calibrated=True, estimator="physics")["refused"].sum()
-        cells = [number(float(np.median(values))) for values in rmse.values()]
-        body.append([manoeuvre, str(len(ratio)), str(refused), *cells, f"{middle:.2f} ({low:.2f} to {high:.2f})"])
-    return table(["drive", "cars", "refused", *columns, "physics calibrated / right file"], body, right_from=1)
+def figures_of_drives(runs: pl.DataFrame) -> Iterator[dict[str, Any]]:
+    """Yield the figures of each manoeuvre and of all: errors (medians, ratio) and intervals of calibrated cars."""
+    for (name,), of in (*runs.group_by("drive", maintain_order=True), (("all",), runs)):
+        rmse = [of.filter(file=f, calibrated=c, estimator=n)["rmse"].to_numpy() for f, c, n in COLUMNS]
+        calibrated = of.filter(calibrated=True, estimator="physics")
+        coverage = calibrated["coverage"].to_numpy()
+        yield {
+            "name": name,
+            "cars": len(rmse[0]),
+            "refused": calibrated.filter(file=WRONG_FILE)["refused"].sum(),
+            "errors": [float(np.median(values)) for values in rmse],
+            "ratio": np.percentile(rmse[4] / rmse[1], [50, 10, 90]),
+            "intervals": len(coverage),
+            "coverage": (np.mean(coverage), *np.percentile(coverage, [10, 50, 90])),
+            "width": float(np.median(calibrated["width"].to_numpy())),
+        }
 
 
-def interval_table(runs: pl.DataFrame) -> str:
-    """Return coverage and width of the 95 % intervals of calibrated cars."""
-    body = []
-    for manoeuvre, some in by_manoeuvre(runs.filter(calibrated=True, estimator="physics")):
-        coverage = some["coverage"].to_numpy()
-        shares = [f"{x:.0%}" for x in (np.mean(coverage), *np.percentile(coverage, [10, 50, 90]))]
-        width = number(float(np.median(some["width"].to_numpy())), 2)
-        body.append([manoeuvre, str(len(coverage)), *shares, width])
-    head = "drive, intervals, coverage: mean, 10 %, median, 90 %, width / RMSE: median"
-    return table(head, body, right_from=1)
-
-
-def d2_table(runs: pl.DataFrame) -> str:
-    """Return the RMSE ratio of an estimate to the estimate with the lowest d2."""
+def d2_ratios(runs: pl.DataFrame) -> Iterator[tuple[float, float, int, FloatArray]]:
+    """Yield bins of d2 over the lowest one of the other estimates, with quantiles of the RMSE ratios."""
     pairs = []
     for _, some in runs.filter(pl.col("d2").is_not_null(), file=WRONG_FILE).group_by("car", "drive"):
         both = some.select("d2", "rmse").rows()
@@ -207,53 +190,42 @@ def d2_table(runs: pl.DataFrame) -> str:
             best = min((pair for k, pair in enumerate(both) if k != i), default=None)
             if best is not None:
                 pairs.append((d2 / best[0], error / best[1]))
-    values, body = np.array(pairs), []
+    values = np.array(pairs)
     for low, high in pairwise((0.0, 0.9, 1.0, 1.05, 1.1, 1.2, 1.5, 2.0, np.inf)):
         inside = values[(values[:, 0] >= low) & (values[:, 0] < high), 1]
         if inside.size:
-            cells = [f"{x:.2f}" for x in np.percentile(inside, [0, 10, 50, 100])]
-            body.append([f"{low:g} to {high:g}", str(inside.size), *cells])
-    return table("v̇_y residual / lowest of the others, estimates, RMSE ratio: lowest, 10 %, median, most", body,
-                 right_from=1)  # fmt: skip
+            yield low, high, inside.size, np.percentile(inside, [0, 10, 50, 100])
 
 
-def coverage_table(scores: pl.DataFrame) -> str:
-    """Return the share of true values within ± 1.96 sd by figure; ``scores``: errors over standard deviation."""
-    body, (lowest, highest) = [], ACCEPTED
+def coverages(scores: pl.DataFrame) -> Iterator[tuple[str, int, float, float, float, str, str]]:
+    """Yield the share of true values within ± 1.96 sd by figure; ``scores``: errors over standard deviation.
+
+    Figure, count, share, RMS, lowest share of a manoeuvre, this manoeuvre, and whether the share is accepted.
+    """
+    lowest, highest = ACCEPTED
     within = scores.with_columns(within=pl.col("score").abs() <= NORMAL_95)
     for (name,), of in within.sort("figure").group_by("figure", maintain_order=True):
         shares = of.group_by("drive", maintain_order=True).agg(pl.col("within").mean())
         drive, least = shares.sort("within", maintain_order=True).row(0)
         share, rms = float(of["within"].to_numpy().mean()), float(np.sqrt(np.mean(of["score"].to_numpy() ** 2)))
         word = "yes" if lowest <= share <= highest else "too wide" if share > highest else "no"
-        body.append([str(name), str(len(of)), f"{share:.0%}", f"{rms:.2f}", f"{least:.0%} ({drive})", word])
-    head = "figure, values, within ± 1.96 sd, RMS error / sd, lowest of a manoeuvre, 90 to 98 %"
-    return table(head, body, right_from=1)
+        yield str(name), len(of), share, rms, least, drive, word
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Simulate, calibrate, and write the page."""
-    parser = options("calibration", __doc__)
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "calibration")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args(arguments)
+    given = options("calibration", __doc__, "work out", cars=CARS).parse_args()
     runs, scores = list[dict[str, Any]](), list[dict[str, Any]]()
     for index in range(given.cars):
         of_car = outcomes(Tool(ROOT, given.work.resolve()), index)
         runs += of_car[0]
         scores += of_car[1]
         print(f"car {index}", file=sys.stderr)
-    done = pl.DataFrame(runs)
-    update(given.out, "calibration.md", {
-        "cars": f"{given.cars} simulated cars, seed {SEED}.",
-        "errors": error_table(done),
-        "intervals": interval_table(done),
-        "d2": d2_table(done),
-        "plus_minus": coverage_table(pl.DataFrame(scores)),
-    })  # fmt: skip
-    return 0
+    done, plus_minus = pl.DataFrame(runs), coverages(pl.DataFrame(scores))
+    about = {"cars": given.cars, "seed": SEED, "columns": COLUMNS, "drives": [*figures_of_drives(done)]}
+    made = blocks(__file__, d2=d2_ratios(done), plus_minus=plus_minus, **about)
+    update(given.out, "calibration.md", made)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

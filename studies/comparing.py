@@ -2,22 +2,19 @@
 
     python -m studies.comparing [--times 5000] [--planted 2000] [--out docs]
 
-The paired log ratios of drives are drawn from a normal and a heavy-tailed distribution (Student's t with 3 degrees of
-freedom, scaled to the same standard deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at
-random.
+``--times``: relabellings without a change. ``--planted``: runs with a change. The paired log ratios of drives are drawn
+from a normal and a heavy-tailed distribution (Student's t with 3 degrees of freedom, scaled to the same standard
+deviation), 0.2 wide. Without a change, relabelling flips the sign of each ratio at random.
 """
-
-from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.evaluation.statistics import paired_change
 from pdhef_logtool.records.signals import FloatArray
-from studies.pages import DOCS, options, table, update
+from studies.pages import blocks, options, update
 
 LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
 COUNTS = (5, 10, 30, 100)
@@ -76,31 +73,20 @@ def shares_of_days(shared: float, times: int, seed: int, drives: int = DRIVES_A_
     return alone / times, together / times
 
 
-def blocks(times: int, planted: int) -> dict[str, str]:
+def tables(times: int, planted: int) -> dict[str, str]:
     """Return the tables by name."""
-    false_alarms, detected = [], []
+    draws, gate = (normal, heavy_tailed), {}
     for count in COUNTS:
-        alarms = [share_closed(draw, count, times, 0.0, 1) for draw in (normal, heavy_tailed)]
-        hits = [share_closed(draw, count, planted, PLANTED, 2) for draw in (normal, heavy_tailed)]
-        naive = share_of_means(normal, count, times, 3)
-        false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
-        detected.append([str(count), *(f"{x:.1%}" for x in hits)])
-    days = [[f"{x:.0%}", *(f"{y:.1%}" for y in shares_of_days(x, times, 4))] for x in SHARED]
-    return {
-        "false_alarms": table("drives, normal, heavy tails, ratio of means", false_alarms, right_from=0),
-        "detected": table("drives, normal, heavy tails", detected, right_from=0),
-        "days": table("between days, --cluster none, default: dependence is estimated", days, right_from=0),
-    }
+        alarms = [share_closed(draw, count, times, 0.0, 1) for draw in draws]
+        hits = [share_closed(draw, count, planted, PLANTED, 2) for draw in draws]
+        gate[count] = (*alarms, share_of_means(normal, count, times, 3)), hits
+    return blocks(__file__, gate=gate, days={shared: shares_of_days(shared, times, 4) for shared in SHARED})
 
 
 def main() -> None:
     """Write the tables into docs/calibration.md."""
-    parser = options("comparing", __doc__)
-    parser.add_argument("--times", type=int, default=5000, help="relabellings without a change")
-    parser.add_argument("--planted", type=int, default=2000, help="runs with a change")
-    parser.add_argument("--out", type=Path, default=DOCS)
-    given = parser.parse_args()
-    update(given.out, "calibration.md", blocks(given.times, given.planted))
+    given = options("comparing", __doc__, "out", times=5000, planted=2000).parse_args()
+    update(given.out, "calibration.md", tables(given.times, given.planted))
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ only with the factor of the row. The runs of the independent simulator are a row
 repository.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +22,7 @@ import polars as pl
 from pdhef_logtool import PdhefError, __version__
 from pdhef_logtool.records.signals import FloatArray
 from studies.gates.tool import Tool
-from studies.pages import INDEPENDENT, ROOT, number, page_options, read_json, table, update, write_json, write_toml
+from studies.pages import INDEPENDENT, OF_PAGES, ROOT, blocks, options, read_json, update, write_json, write_toml
 from studies.pictures import save, subplots
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
@@ -42,9 +40,6 @@ DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
 #: Okabe and Ito (2008), without yellow.
 COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
 RESAMPLES = 2000
-README_ROWS = (
-    "extrapolation", "other-vehicle", "friction-minus-20", "bank-and-grade", INDEPENDENT_ROW, "paper-a", "paper-b",
-)  # fmt: skip
 KEPT_METRICS = ("rmse", "availability", "coverage95", "lag_s", "nees", "nis", "nis_dof")
 
 
@@ -149,26 +144,14 @@ def write_page(out: Path, folder: Path) -> None:
     label = f"median sideslip RMSE of {SUBJECT} over that of the reference, 95 % interval"
     plot(pictures / "ratios.png", rows, ratios, label, limits={1.0: "-", MARGIN: ":"})
 
-    covered = metrics.filter(metric="coverage95", estimator=SUBJECT)
-    summary, counts = [], []
-    for i, row in enumerate(rows):
-        of = covered.filter(row=row)
-        share = f"{100 * np.average(of['value'], weights=of['n']):.0f} %" if len(of) else "–"
-        cells = [number(drawn[n][i, 1]) for n in drawn]
-        summary.append([row, facts["rows"][row], str(errors.filter(row=row).height), *cells, share])
-    for reference, bounds in ratios.items():
-        words = [verdict(low, high) for low, _, high in bounds]
-        above = [f"{r} ({value:.2f})" for r, (_, value, _) in zip(rows, bounds, strict=True) if value > MARGIN]
-        numbers = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
-        counts.append([reference, *numbers, ", ".join(above) or "none"])
-    head = ["row", "condition", "drives", *drawn, f"coverage of {SUBJECT}"]
-    few = [cells[1:-1] for name in README_ROWS for cells in summary if cells[0] == name]
-    update(out, "README.md", {"conditions": table(head[1:-1], few, right_from=1)})
-    update(out, "conditions.md", {
-        "command": f"Command: `{facts['command']}`. Car: {facts['car']}; pdhef-logtool {facts['version']}.",
-        "summary": table(head, summary),
-        "counts": table(f"reference, better, not worse, open, worse, ratio above {MARGIN}", counts),
-    })  # fmt: skip
+    covered = metrics.filter(metric="coverage95", estimator=SUBJECT).group_by("row")
+    coverage = covered.agg((pl.col("value") * pl.col("n")).sum() / pl.col("n").sum())
+    about = {"facts": facts, "rows": rows, "drawn": drawn, "ratios": ratios, "independent": INDEPENDENT_ROW}
+    about |= {"drives": dict(errors["row"].value_counts().iter_rows()), "coverage": dict(coverage.iter_rows())}
+    verdicts = {o: [verdict(low, high) for low, _, high in bounds] for o, bounds in ratios.items()}
+    made = blocks(__file__, subject=SUBJECT, margin=MARGIN, verdicts=verdicts, **about)
+    update(out, "README.md", {"conditions": made.pop("conditions")})
+    update(out, "conditions.md", made)
 
 
 def plot(
@@ -202,14 +185,11 @@ def plot(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
-    parser = page_options("conditions", __doc__)
+    parser = options("conditions", __doc__, OF_PAGES, drives=10, seed=1, jobs=2)
     parser.add_argument("--car", default="saloon")
     parser.add_argument("--network", type=Path, help="instead of the car's")
     all_rows = (*ROW_NAMES, INDEPENDENT_ROW)
     parser.add_argument("--rows", nargs="+", choices=all_rows, default=all_rows, metavar="ROW", help="all by default")
-    parser.add_argument("--drives", type=int, default=10, help="drives a row")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args(arguments)
     try:
         if not given.stored:

@@ -1,14 +1,12 @@
 """Tables of the documentation that are made of the code: ``python -m studies.documentation_tables`` writes them.
 
-A table is between ``<!-- table: metrics -->`` and ``<!-- end -->``; the names of the others are in :data:`_TABLES`.
+A table is between ``<!-- table: metrics -->`` and ``<!-- end -->``; ``documentation_tables.md`` contains all.
 """
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields
-from functools import partial
+from functools import cache
 from typing import Any
 
 from pdhef_logtool.car.assumed_values import RULES
@@ -20,38 +18,35 @@ from pdhef_logtool.logs.resource_limits import ResourceLimits
 from pdhef_logtool.results.opened_run import TABLES
 from pdhef_logtool.results.parquet_sink import load_schema
 from pdhef_logtool.runs.config import RunConfig
-from studies.pages import DOCS, table, write
+from studies.pages import DOCS, blocks, write
 from truthsim.manoeuvres import MANOEUVRES
 from truthsim.sensors import SensorNoise
 
 
 def with_tables(markdown: str) -> str:
     """Return a page with its tables; raises KeyError for one of an unknown name."""
-
-    def made(match: re.Match[str]) -> str:
-        head, rows = _TABLES[match[2]]
-        body = ([cell.replace("|", "&#124;") for cell in row] for row in rows())
-        return f"{match[1]}\n\n{table(head, body)}\n\n{match[3]}"
-
-    return re.sub(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", made, markdown, flags=re.DOTALL)
+    pattern = re.compile(r"(<!-- table: (\w+) -->).*?(<!-- end -->)", re.DOTALL)
+    return pattern.sub(lambda match: f"{match[1]}\n\n{made_tables()[match[2]]}\n\n{match[3]}", markdown)
 
 
-def _metrics() -> Iterator[tuple[str, ...]]:
-    for m in metrics.registered().values():
-        unit = "that of the signal" if m.unit is None else m.unit
-        yield f"`{m.name}`", m.label, unit, m.direction or "–", m.definition
-
-
-def _estimators() -> Iterator[tuple[str, ...]]:
-    for spec in SPECS:
-        needs = [*sorted(spec.needs), " or ".join(sorted(spec.one_of))]
-        yield f"`{spec.name}`", spec.text, ", ".join(filter(None, needs))
-
-
-def _checks() -> Iterator[tuple[str, ...]]:
-    for name, entry in TABLE.items():
-        remedy = re.sub(r"{\w+(:[^}]*)?}", "…", entry["remedy"])
-        yield f"`{name}`", entry["compares"], entry["fails"], "–" if remedy == "…" else remedy
+@cache
+def made_tables() -> dict[str, str]:
+    """Return all tables by name."""
+    return blocks(
+        __file__,
+        metrics=metrics.registered().values(),
+        specs=SPECS,
+        checks=TABLE,
+        remedies={name: re.sub(r"{\w+(:[^}]*)?}", "…", entry["remedy"]) for name, entry in TABLE.items()},
+        settings=_entries(RunConfig, {f.name: f.default for f in fields(RunConfig)}),
+        sensors=_entries(Sensors, Sensors().model_dump()),
+        sensor_errors=_entries(SensorNoise, SensorNoise()._asdict()),
+        limits=_entries(ResourceLimits, asdict(ResourceLimits())),
+        rules=RULES,
+        manoeuvres=MANOEUVRES,
+        tables=TABLES,
+        schemas={name: load_schema(f"{name}.parquet.json") for name in (*TABLES, "estimates", "residuals")},
+    )
 
 
 def _entries(kind: type, defaults: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
@@ -61,40 +56,7 @@ def _entries(kind: type, defaults: Mapping[str, Any]) -> Iterator[tuple[str, ...
     for key, value in defaults.items():
         text = re.sub(r" \(:func:`[^`]*`\)", "", " ".join(texts[key].split())).replace("``", "`")
         number = f"{value:,}" if type(value) is int else f"{value:.4g}" if isinstance(value, float) else ""
-        yield f"`{key}`", "–" if value in (None, ()) else number or str(value).lower(), text
-
-
-def _tables() -> Iterator[tuple[str, ...]]:
-    for name in TABLES:
-        schema = load_schema(f"{name}.parquet.json")
-        yield f"`{name}`", schema["title"].partition(": ")[2], ", ".join(f"`{c['name']}`" for c in schema["columns"])
-
-
-def _columns(name: str) -> Iterator[tuple[str, ...]]:
-    for column in load_schema(f"{name}.parquet.json")["columns"]:
-        yield f"`{column['name']}`", column["unit"], column["description"]
-
-
-_TABLES: dict[str, tuple[str, Callable[[], Iterable[tuple[str, ...]]]]] = {
-    "metrics": ("metric, label, unit, best, definition", _metrics),
-    "estimators": ("name, estimate, needs", _estimators),
-    "checks": ("check, compares, fails where, remedy", _checks),
-    "settings": ("key, default, meaning", lambda: _entries(RunConfig, {f.name: f.default for f in fields(RunConfig)})),
-    "sensors": ("key, default, meaning", lambda: _entries(Sensors, Sensors().model_dump())),
-    "sensor_errors": ("name, default, meaning", lambda: _entries(SensorNoise, SensorNoise()._asdict())),
-    "limits": ("limit, default, meaning", lambda: _entries(ResourceLimits, asdict(ResourceLimits()))),
-    "assumed_values": (
-        "entry left out, rule, spread",
-        lambda: ((f"`{entry}`", rule["text"], f"{rule['spread']:.0%}") for entry, rule in RULES.items()),
-    ),
-    "manoeuvres": (
-        "name, manoeuvre, km/h, μ",
-        lambda: ((f"`{n}`", m.description, f"{m.speed_km_h:g}", f"{m.friction:g}") for n, m in MANOEUVRES.items()),
-    ),
-    "tables": ("table, rows, columns", _tables),
-    "estimates": ("column, unit, meaning", partial(_columns, "estimates")),
-    "residuals": ("column, unit, meaning", partial(_columns, "residuals")),
-}  # fmt: skip
+        yield key, "–" if value in (None, ()) else number or str(value).lower(), text
 
 
 if __name__ == "__main__":

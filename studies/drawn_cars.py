@@ -4,8 +4,6 @@ Saloons, SUVs and hatchbacks of all loads, heights, tyres and wear, with sensors
 fitted to a ramp steer (``fit_vehicle``), as after a measurement.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,14 +21,9 @@ from truthsim.vehicle_choice import choose_vehicle
 KINDS = ("sedan", "suv")
 #: Share of the cars that get the tyres of the other kind.
 OTHER_TYRES_SHARE = 0.3
-#: Ranges of the uniform draws, and factors on the usual 1-sigma of sensors.
+#: Ranges of the uniform draws, factors on the usual 1-sigma of sensors, and ranges of their other values.
 _DRAWS = read_toml(Path(__file__).with_suffix(".toml"))
-DELAY_S = (0.0, 0.040)
 STEER_GAIN = 0.01
-#: Free play of the steering at the road wheels: up to 2.5 degrees at a steering wheel of ratio 15.
-STEER_PLAY_RAD = (0.0, 0.003)
-#: Where the IMU may be from where the car's file has it, forward and to the left; the same of the INS, and its heading.
-LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
 #: Less understeer than this no maker sells: 0.5 degrees per g.
 LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
 #: Entries of the vehicle file that are those of the simulated car.
@@ -76,12 +69,8 @@ def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
         name: usual[name] * float(np.exp(rng.uniform(np.log(low), np.log(high))))
         for name, (low, high) in _DRAWS["sensor_factors"].items()
     }
-    values["can_delay_s"] = float(rng.uniform(*DELAY_S))
+    values |= {name: float(rng.uniform(*limits)) for name, limits in _DRAWS["sensors"].items()}
     values["steer_gain"] = STEER_GAIN
-    values["steer_play_rad"] = float(rng.uniform(*STEER_PLAY_RAD))
-    values["rtk_heading_offset_rad"] = float(rng.uniform(-TRUTH_HEADING_RAD, TRUTH_HEADING_RAD))
-    for reach, names in ((LEVER_M, ("imu_x_m", "imu_y_m")), (TRUTH_LEVER_M, ("rtk_x_m", "rtk_y_m"))):
-        values |= {name: float(rng.uniform(-reach, reach)) for name in names}
     return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
 
 

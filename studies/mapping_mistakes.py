@@ -7,9 +7,6 @@ remedy, *refused* if the mapping file is, *stopped* if a check of its signal fai
 another signal fails instead, *silent* if its checks pass, and *open* if they are undecided.
 """
 
-from __future__ import annotations
-
-import argparse
 import copy
 import re
 import tempfile
@@ -26,7 +23,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.mapping.mapping_file import load_mapping
 from studies.gates.tool import Tool
-from studies.pages import ROOT, read_toml, write_toml
+from studies.pages import ROOT, options, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, vehicle_table
 
 _UNITS = {"57.3": 57.3, "9.81": 9.81, "3.6": 3.6}
@@ -156,13 +153,13 @@ def recognised(log: Path, folder: Path) -> dict[str, Any]:
     return Tool(ROOT, folder).mapping(log) if peer is None else mapping_table(peer)
 
 
-def main(arguments: Sequence[str] | None) -> int:
+def main() -> None:
     """Count the outcomes over logs and print those that are not named."""
-    parser = argparse.ArgumentParser(prog="python -m studies.mapping_mistakes", description=main.__doc__)
+    parser = options("mapping_mistakes", __doc__)
     parser.add_argument("--car", action="store_true", help="with the published vehicle files of recorded drives")
     parser.add_argument("logs", nargs="*", type=Path, default=[ROOT / "sample_logs" / f"{n}.mcap" for n in SAMPLES])
-    options = parser.parse_args(arguments)
-    look, paths = look_at_with_car if options.car else look_at, [path.resolve() for path in options.logs]
+    given = parser.parse_args()
+    look, paths = look_at_with_car if given.car else look_at, [path.resolve() for path in given.logs]
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -174,8 +171,7 @@ def main(arguments: Sequence[str] | None) -> int:
                     print(f"    {check['verdict']} {check['name']}: {check['evidence']}; {check['remedy']}")
     total = counts.total()
     print(f"{total} mistakes: " + ", ".join(f"{n} {v} ({n / total:.1%})" for v, n in counts.most_common()))
-    return 0
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(None))
+    main()

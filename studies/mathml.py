@@ -3,8 +3,6 @@
 In a page, ``$…$`` is LaTeX within a line and ``$$…$$`` an equation in a separate paragraph. Code stays as it is.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

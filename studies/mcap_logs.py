@@ -1,7 +1,5 @@
 """MCAP logs message by message: copied with other chunks, other times or further topics."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path

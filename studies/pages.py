@@ -1,19 +1,22 @@
-"""Shared by the pages: paths of the repository, Markdown tables and numbers, filled blocks, options of the commands."""
+"""Shared by the pages: paths of the repository, numbers, templates and filled blocks, options of the commands.
 
-from __future__ import annotations
+The sentences and tables of a page are in the Markdown template beside its module: a whole page, or the blocks of a page
+of the documentation (:func:`blocks`).
+"""
 
 import argparse
 import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
+from pdhef_logtool.storage import templates
 from pdhef_logtool.storage.files import write_bytes
 from pdhef_logtool.storage.toml_text import toml_text
 
@@ -26,13 +29,6 @@ DRIVES = ROOT.parent / "shared" / "data" / "drives"
 INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 
 
-def table(head: str | Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
-    """Return a Markdown table, columns from ``right_from`` on ranged right; a text as head has commas between names."""
-    names = head.split(", ") if isinstance(head, str) else list(head)
-    rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
-
-
 def number(value: float, digits: int = 3) -> str:
     """Format a figure; a non-finite value is a dash."""
     return "–" if not math.isfinite(value) else f"{value:.{digits}f}"
@@ -41,17 +37,22 @@ def number(value: float, digits: int = 3) -> str:
 def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
     """Put blocks between their comments ``<!-- begin NAME -->`` and ``<!-- end NAME -->``; no place is an error."""
     for name, text in blocks.items():
-        pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        places = list(pattern.finditer(page))
+        before, *places = re.split(rf"(?s)(?<=<!-- begin {name} -->\n).*?(?=<!-- end {name} -->)", page)
         if len(places) != 1:
             raise SystemExit(f"{where}: expected one place for {name}")
-        page = f"{page[: places[0].end(1)]}{text}\n{page[places[0].start(2) :]}"
+        page = f"{before}{text}\n{places[0]}"
     return page
 
 
-def template(module: str, **texts: object) -> str:
-    """Return the Markdown file beside a module (its ``__file__``) with texts in place of ``{name}``."""
-    return Path(module).with_suffix(".md").read_text(encoding="utf-8").format(**texts)
+def template(module: str | Path, **context: object) -> str:
+    """Render the Markdown template beside a module (its ``__file__``)."""
+    return templates.template(Path(module).with_suffix(".md"), number=number).render(context)
+
+
+def blocks(module: str, **context: object) -> dict[str, str]:
+    """Render the Markdown template beside a module; return the blocks between comments as of :func:`fill`."""
+    found = re.findall(r"<!-- begin (\w+) -->\n(.*?)<!-- end \1 -->", template(module, **context), re.DOTALL)
+    return {name: text.strip("\n") for name, text in found}
 
 
 def update(folder: Path, name: str, blocks: Mapping[str, str]) -> None:
@@ -107,17 +108,26 @@ def write_validated_car(folder: Path, vehicle: Mapping[str, Any]) -> Path:
     return folder
 
 
-def options(name: str, text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
+def options(name: str, text: str | None, usual: str = "", **numbers: float) -> argparse.ArgumentParser:
+    """Return the parser of ``python -m studies.NAME``; ``text``, which describes its options, is its module's.
+
+    Parameters
+    ----------
+    usual : names of usual options. numbers : further options with their defaults.
+    """
     shape = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
-
-
-def page_options(name: str, text: str | None) -> argparse.ArgumentParser:
-    """Return the parser of a study with stored results and a page."""
-    parser = options(name, text)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / name, help="folder of logs and runs")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
-    parser.add_argument("--results", type=Path, default=RESULTS / name, help="folder of the results")
-    parser.add_argument("--stored", action="store_true", help="write the page of the stored results")
+    parser = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)
+    known: dict[str, dict[str, Any]] = {
+        "work": {"type": Path, "default": ROOT / "out" / name, "help": "folder of logs and runs"},
+        "out": {"type": Path, "default": DOCS, "help": "folder of the page"},
+        "results": {"type": Path, "default": RESULTS / name, "help": "folder of the results"},
+        "stored": {"action": "store_true", "help": "write the page of the stored results"},
+    }
+    known |= {option: {"type": type(default), "default": default} for option, default in numbers.items()}
+    for option in (*usual.split(), *numbers):
+        parser.add_argument(f"--{option.replace('_', '-')}", **known[option])
     return parser
+
+
+#: Usual options of a study with stored results and a page.
+OF_PAGES = "work out results stored"

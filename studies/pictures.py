@@ -1,7 +1,5 @@
 """How the pages' pictures are set up and written: small PNGs, the same bytes for the same figures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

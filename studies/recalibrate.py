@@ -9,8 +9,6 @@ first. Comments, docstrings and the layout of pages (``studies.pages``, ``studie
 The stamp files are in ``out/recalibrate``. ``--evidence``: only the stages that write pages of ``docs``.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import shlex
@@ -52,11 +50,10 @@ def load_stages() -> tuple[Stage, ...]:
         for pattern in patterns:
             yield from expanded(sets[pattern[1:]]) if pattern.startswith("@") else (pattern,)
 
-    stages = []
-    for name, entry in document.items():
-        given: dict[str, Any] = {k: v if isinstance(v, str) else tuple(expanded(v)) for k, v in entry.items()}
-        stages.append(Stage(name, **given))
-    return tuple(stages)
+    def entries(table: dict[str, Any]) -> dict[str, Any]:
+        return {key: v if isinstance(v, str) else tuple(expanded(v)) for key, v in table.items()}
+
+    return tuple(Stage(name, **entries(table)) for name, table in document.items())
 
 
 def input_digest(root: Path, inputs: Sequence[str]) -> str:

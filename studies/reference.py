@@ -8,21 +8,18 @@ from ground truth and marked so. Only cases with changed inputs are recomputed.
 Recorded drives were seen while constants were chosen: their figures are development figures.
 """
 
-from __future__ import annotations
-
 import hashlib
 import heapq
 import json
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import polars as pl
 from scipy.signal import lfilter
 
 from pdhef_logtool import Car
@@ -33,7 +30,7 @@ from studies import pages
 from studies.drawn_cars import FIT_FRICTION, fit_vehicle
 from studies.gates.tool import Tool, estimates, metrics, reports, sideslip_rmse_deg
 from studies.mcap_logs import Message, messages, write_log
-from studies.pages import DRIVES, ROOT, number, table, write_toml
+from studies.pages import DRIVES, ROOT, write_toml
 from studies.peers.drives import PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 from studies.recalibrate import input_digest
 from truthsim.batch import DriveSpec
@@ -53,19 +50,9 @@ LATE_S = 0.06
 RANKED, CLEAR_DEG = ("zero", "kinematic", "open-loop", "phy-ukf", "physics"), 0.3
 
 
-@dataclass(frozen=True, slots=True)
-class Receiver:
-    """GNSS velocity made from ground truth: rate, white and correlated 1-sigma errors, and how late it is."""
-
-    rate_hz: float
-    white_m_s: float
-    correlated_m_s: float
-    correlated_s: float
-    delay_s: float = 0.0
-
-
 _TABLES = pages.read_toml(Path(__file__).with_suffix(".toml"))
-RECEIVERS = {name: Receiver(**entries) for name, entries in _TABLES["receivers"].items()}
+#: GNSS velocity made from ground truth: rate, white and correlated 1-sigma errors, and how late it is.
+RECEIVERS: dict[str, dict[str, float]] = _TABLES["receivers"]
 NONE, REAL = "none", "recorded"
 
 
@@ -100,25 +87,25 @@ class Motion(NamedTuple):
     roll_rate_rad_s: FloatArray
 
 
-def made_gnss(motion: Motion, receiver: Receiver, fault: str) -> tuple[IntArray, FloatArray]:
+def made_gnss(motion: Motion, receiver: Mapping[str, float], fault: str) -> tuple[IntArray, FloatArray]:
     """Return the stamps [M] and the velocities [M, 2] to the east and north that a receiver would show."""
     rng = np.random.default_rng(7)
     t = (motion.stamps_ns - motion.stamps_ns[0]) * 1e-9
-    sampled = np.arange(0.0, t[-1], 1.0 / receiver.rate_hz)
+    sampled = np.arange(0.0, t[-1], 1.0 / receiver["rate_hz"])
     rate = np.gradient(np.unwrap(motion.heading_rad), t)
     forward = motion.vx_m_s - ANTENNA_M[1] * rate
     left = motion.vy_m_s + ANTENNA_M[0] * rate - ANTENNA_HEIGHT_M * motion.roll_rate_rad_s
     cos, sin = np.cos(motion.heading_rad + 0.7), np.sin(motion.heading_rad + 0.7)
-    keep = math.exp(-1.0 / (receiver.rate_hz * receiver.correlated_s))
+    keep = math.exp(-1.0 / (receiver["rate_hz"] * receiver["correlated_s"]))
     columns = []
     for component in (cos * forward - sin * left, sin * forward + cos * left):
         drawn = rng.standard_normal(len(sampled) + 1)[:-1]
         drawn[1:] *= math.sqrt(1.0 - keep**2)
         correlated = lfilter([1.0], [1.0, -keep], drawn)
         good = np.isfinite(component)
-        made = np.interp(sampled - receiver.delay_s, t[good], component[good])
+        made = np.interp(sampled - receiver.get("delay_s", 0.0), t[good], component[good])
         columns.append(
-            made + receiver.correlated_m_s * correlated + receiver.white_m_s * rng.standard_normal(len(made))
+            made + receiver["correlated_m_s"] * correlated + receiver["white_m_s"] * rng.standard_normal(len(made))
         )
     velocity = np.stack(columns, axis=1)
     stamps = motion.stamps_ns[0] + np.rint(sampled * 1e9).astype(np.int64)
@@ -269,13 +256,6 @@ def run(
     return tool.run(name, log, *files, "--keep", "estimates", "--reference", "on", *waived, *given)
 
 
-def tracks_of(folder: Path) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return ground truth and reference of a run at the stamps that both have."""
-    tracks = estimates(folder)
-    truth, reference = (tracks.filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference"))
-    return truth.join(reference, on="stamp_ns", how="semi"), reference.join(truth, on="stamp_ns", how="semi")
-
-
 def motion_of(folder: Path) -> Motion:
     """Return the motion of a recorded drive from the ground truth of a run."""
     truth = estimates(folder).filter(estimator="truth").sort("stamp_ns")
@@ -285,9 +265,10 @@ def motion_of(folder: Path) -> Motion:
 
 
 def scored_run(folder: Path, case: Case, vehicle: dict[str, Any]) -> Figures:
-    """Return the figures of the reference of a run."""
+    """Return the figures of the reference of a run at the stamps that it shares with the ground truth."""
     (report,) = (r["reference"] for r in reports(folder).values())
-    truth, reference = tracks_of(folder)
+    sides = [estimates(folder).filter(estimator=name).sort("stamp_ns") for name in ("truth", "reference")]
+    truth, reference = (a.join(b, on="stamp_ns", how="semi") for a, b in (sides, sides[::-1]))
     vx, vy = (truth[n].to_numpy() for n in ("vx_m_s", "vy_m_s"))
     if case.fault == AT_ANTENNA:
         (antenna,) = (p["value"] for p in report["parameters"] if p["name"] == "antenna x")
@@ -325,57 +306,33 @@ def rankings(folder: Path, errors: dict[str, float]) -> tuple[int, int, int, int
     return len(claims), agreed, len(clear), sum(pair in claims for pair in clear)
 
 
-_HEAD = "drive, GNSS, fault, true RMS, RMSE, target, ±, coverage, valid, RMSE there, physics, with GNSS, refused"
-
-
-def _row(case: Case, got: Figures) -> list[str]:
-    """Return the line of a case; an error above its target is bold."""
-    gnss = case.gnss if got["used_gnss"] or case.gnss == NONE else f"{case.gnss}, not used"
-    rmse, target = number(got["rmse"]), case.target_deg
-    missed = target is not None and not (got["rmse"] <= target and not got["refused"])
-    coverage = f"{100 * got['coverage']:.0f} %" if math.isfinite(got["coverage"]) else "–"
-    return [
-        case.title, gnss, case.fault or "–", number(got["truth"], 2), f"**{rmse}**" if missed else rmse,
-        "–" if target is None else f"{target:.2f}", number(got["std"], 2), coverage,
-        f"{100 * got['valid_share']:.0f} %", number(got["valid_rmse"], 2), number(got["physics"]), number(got["aided"]),
-        got["refused"].partition(" (")[0] or "–",
-    ]  # fmt: skip
-
-
-def _rankings(done: Sequence[tuple[Case, Figures]]) -> list[list[str]]:
-    rows = []
-    for name, titles in (
-        ("recorded", [entry["title"] for entry in _TABLES["recorded"].values()]),
-        ("simulated", (*SIMULATED, *_TABLES["road"])),
-        ("simulated, other cars", OTHER_CARS),
-    ):
-        pairs = [f["pairs"] for c, f in done if c.title in titles and c.fault != AT_ANTENNA]
-        claimed, agreed, clear, found = np.sum(np.array(pairs).reshape(-1, 4), axis=0, dtype=int).tolist()
-        agree = "–" if not claimed else f"{100.0 * agreed / claimed:.0f} %"
-        share = "–" if not clear else f"{100.0 * found / clear:.0f} %"
-        rows.append([name, str(claimed), agree, str(clear), share])
-    return rows
-
-
 def blocks(results: dict[str, Figures]) -> dict[str, str]:
     """Return the tables of the stored figures by name."""
     done = [(case, results[case.name]) for case in cases() if case.name in results]
-    aided = [f for c, f in done if math.isfinite(f["aided"]) and c.fault != AT_ANTENNA]
-    worse = sum(f["aided"] > f["physics"] + max(0.05 * f["physics"], 0.003) for f in aided)
-    head = f"drives, ranked, as by ground truth, pairs that differ by more than {CLEAR_DEG}°, of these ranked"
-    return {
-        "recorded": table(_HEAD, [_row(c, f) for c, f in done if c.log]),
-        "simulated": table(_HEAD, [_row(c, f) for c, f in done if c.spec is not None]),
-        "causal": f"In {worse} of {len(aided)} rows, `physics` is worse with GNSS by more than 5 % and 0.003°.",
-        "rankings": table(head, _rankings(done)),
+    ranked = [(case, got) for case, got in done if case.fault != AT_ANTENNA]
+    aided = [got for _, got in ranked if math.isfinite(got["aided"])]
+    titles = {
+        "recorded": [entry["title"] for entry in _TABLES["recorded"].values()],
+        "simulated": [*SIMULATED, *_TABLES["road"]],
+        "simulated, other cars": OTHER_CARS,
     }
+    pairs = {name: [got["pairs"] for case, got in ranked if case.title in of] for name, of in titles.items()}
+    return pages.blocks(
+        __file__,
+        recorded=[(case, got) for case, got in done if case.log],
+        simulated=[(case, got) for case, got in done if case.spec is not None],
+        worse=sum(got["aided"] > got["physics"] + max(0.05 * got["physics"], 0.003) for got in aided),
+        aided=len(aided),
+        clear_deg=CLEAR_DEG,
+        rankings={name: np.sum(np.reshape(of, (-1, 4)), axis=0, dtype=int).tolist() for name, of in pairs.items()},
+    )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Compute the cases that are not stored yet, and write the page."""
-    parser = pages.page_options("reference", __doc__)
+    parser = pages.options("reference", __doc__, pages.OF_PAGES)
     parser.add_argument("--cases", nargs="+", default=[""], metavar="TEXT", help="parts of the names of cases")
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     file = given.results / STORED
     stored: dict[str, Figures] = pages.read_json(file) if file.is_file() else {}
     source = input_digest(ROOT, [f"{folder}/**/*.py" for folder in ("pdhef_logtool", "truthsim", "studies")])
@@ -390,8 +347,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stored[case.name] = {"key": key, **figures(case, tool)}
         pages.write_json(file, stored)
     pages.update(given.out, "reference.md", blocks(stored))
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,8 +8,6 @@ for a car taught by the sideslip reference in place of ground truth, if the refe
 ``../shared`` and may not be redistributed. Without them, the command ends with 0 and writes no file.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator, Sequence
@@ -22,7 +20,7 @@ import polars as pl
 
 from studies import pages
 from studies.gates.tool import Tool, estimates, metrics
-from studies.pages import DRIVES, ROOT, number, read_toml, table, write_toml
+from studies.pages import DRIVES, ROOT, read_toml, write_toml
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES, mapping_table, peer_drive, vehicle_table
 
 STORED = "pairs.json"
@@ -161,54 +159,29 @@ def pairs_of(tool: Tool, car: TeachCar) -> Iterator[Pair]:
             }
 
 
-def pair_table(results: Sequence[Pair]) -> str:
-    """Return one line per pair."""
-
-    def cell(s: Score) -> str:
-        return f"{s['rmse_deg']:.3f} ({s['without_constant_deg']:.3f})"
-
-    body = [[
-            r["car"], r["taught"], r["scored"], *(cell(r[way]) for way in ("untaught", "prior", "hybrid")),
-            number(ratio(r), 2) + (" worse" if is_worse(r) else ""),
-            number(ratio(r, "reference"), 2) if r["reference"] else "–",
-            number(r["paper_deg"], 3), r["rung"], f"{r['hybrid']['active']:.0%}",
-            " / ".join("–" if (c := r[way]["covered"]) is None else f"{c:.0%}" for way in ("untaught", "hybrid")),
-        ] for r in results]  # fmt: skip
-    head = "car, taught on, scored on, untaught, taught, pd-hef, ratio, reference, paper, residual, active, 95 %"
-    return table(head, body, right_from=3)
-
-
-def summary(results: Sequence[Pair]) -> str:
-    """Return the figures that the targets are about."""
-    referred = [r for r in results if r["reference"]]
-    alike, unlike = ([ratio(r) for r in results if (r["hybrid"]["active"] >= ALIKE) is side] for side in (True, False))
-    small = [r["hybrid"]["rmse_deg"] / r["kinematic_deg"] for r in results if r["car"] == "1:10 F1TENTH"]
-    paper = [r["paper_deg"] / r["untaught"]["rmse_deg"] for r in results]
-    lines = {
-        "pairs worse than untaught by more than max(5 %, 0.03°)": str(sum(map(is_worse, results))),
-        "geometric mean of the ratios, residual active on at least 50 %": mean(alike),
-        "geometric mean of the ratios, residual active on less": mean(unlike),
-        "the same with the prior alone, all pairs": mean([ratio(r, "prior") for r in results]),
-        "the same with the paper's network, all pairs": mean(paper),
-        "1:10 cars, pd-hef over kinematic": mean(small),
-        "geometric mean of the ratios, taught by the reference": mean([ratio(r, "reference") for r in referred]),
-        "the same pairs, taught by ground truth": mean([ratio(r) for r in referred]),
-        "pairs worse than untaught by more than that, taught by the reference":
-            str(sum(is_worse(r, "reference") for r in referred)),
-    }  # fmt: skip
-    return table("figure, value", lines.items())
-
-
-def readme_text(results: Sequence[Pair]) -> str:
-    """Return the result in a sentence."""
+def blocks(results: Sequence[Pair]) -> dict[str, str]:
+    """Return table and summary of the pairs, and the sentence of README.md, by name."""
     full_size = {part.car for part in PEER_DRIVES if part.group == FULL_SIZE}
-    full = [ratio(r) for r in results if r["car"] in full_size]
-    worse = ", ".join(f"`{r['scored']}` by {ratio(r) - 1.0:.0%}" for r in results if is_worse(r)) or "none"
-    of_all, of_prior = mean([ratio(r) for r in results]), mean([ratio(r, "prior") for r in results])
-    return (
-        f"A car taught on a recorded drive has {of_all} times the error on other drives, full-size cars {mean(full)}, "
-        f"by the taught prior alone {of_prior}; worse by more than 5 % and 0.03°: {worse} "
-        "([teaching](docs/peers.md#teaching))."
+    referred = [r for r in results if r["reference"]]
+    ratios = {
+        "all": [ratio(r) for r in results],
+        "full_size": [ratio(r) for r in results if r["car"] in full_size],
+        "alike": [ratio(r) for r in results if r["hybrid"]["active"] >= ALIKE],
+        "unlike": [ratio(r) for r in results if r["hybrid"]["active"] < ALIKE],
+        "prior": [ratio(r, "prior") for r in results],
+        "paper": [r["paper_deg"] / r["untaught"]["rmse_deg"] for r in results],
+        "small": [r["hybrid"]["rmse_deg"] / r["kinematic_deg"] for r in results if r["car"] == "1:10 F1TENTH"],
+        "reference": [ratio(r, "reference") for r in referred],
+        "by_truth": [ratio(r) for r in referred],
+    }
+    return pages.blocks(
+        __file__,
+        results=results,
+        ratio=ratio,
+        is_worse=is_worse,
+        mean={name: mean(of) for name, of in ratios.items()},
+        worse=[r for r in results if is_worse(r)],
+        worse_by_reference=sum(is_worse(r, "reference") for r in referred),
     )
 
 
@@ -217,26 +190,25 @@ def mean(ratios: Sequence[float]) -> str:
     return f"{math.exp(float(np.mean(np.log(ratios)))):.2f} ({len(ratios)} pairs)" if ratios else "–"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main() -> None:
     """Run the pairs and write the page."""
-    parser = pages.page_options("teaching", __doc__)
+    parser = pages.options("teaching", __doc__, pages.OF_PAGES)
     parser.add_argument("--cars", nargs="+", choices=[c.name for c in CARS], default=[c.name for c in CARS])
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     if not given.stored:
         if not DRIVES.is_dir():
             print("nothing is done: needs ../shared beside the repository")
-            return 0
+            return
         results = []
         for car in (c for c in CARS if c.name in given.cars):
             for result in pairs_of(Tool(ROOT, given.work.resolve()), car):
                 results.append(result)
-                print(pair_table([result]).splitlines()[-1], file=sys.stderr)
+                print(blocks([result])["pairs"].splitlines()[-1], file=sys.stderr)
         pages.write_json(given.results / STORED, results)
-    stored = pages.read_json(given.results / STORED)
-    pages.update(given.out, "README.md", {"teaching": readme_text(stored)})
-    pages.update(given.out, "peers.md", {"pairs": pair_table(stored), "pairs_summary": summary(stored)})
-    return 0
+    made = blocks(pages.read_json(given.results / STORED))
+    pages.update(given.out, "README.md", {"teaching": made.pop("teaching")})
+    pages.update(given.out, "peers.md", made)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

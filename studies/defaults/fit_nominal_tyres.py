@@ -12,8 +12,6 @@ angle over friction, so that the peak follows friction and the stiffness stays. 
 other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -22,6 +20,7 @@ from scipy.optimize import least_squares
 
 from pdhef_logtool.car.vehicle import AxleTyre, VehicleParameters
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.storage.templates import template
 from studies.pages import options
 from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
 from truthsim.motion import Motion, simulate_motion
@@ -119,15 +118,10 @@ def ramp(friction: float, car: Vehicle = CAR) -> Motion:
 
 def vehicle_text(motion: Motion, fits: dict[str, AxleTyre], *, name: str, friction: float) -> str:
     """Return a vehicle file."""
-    tyres = "\n".join(
-        f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}\n"
-        "reference_friction = 1.0"
-        for axle, fit in fits.items()
-    )
-    roads = " and ".join(f"{road:g}" for _, road in ROADS.values())
-    text = Path(__file__).with_name("nominal_vehicle.txt").read_text(encoding="utf-8")
-    given = {"name": name, "friction": friction, "car": CAR, "noise": NOISE, "speed_km_h": SPEED_KM_H}
-    return text.format(**given, roads=roads, tyres=tyres, roll_gradient=roll_gradient_rad_per_m_s2(motion))
+    about = {"name": name, "friction": friction, "roads": [road for _, road in ROADS.values()], "tyres": fits}
+    about |= {"car": CAR, "noise": NOISE, "speed_km_h": SPEED_KM_H}
+    file = template(Path(__file__).with_name("nominal_vehicle.txt"))
+    return file.render(about, roll_gradient=roll_gradient_rad_per_m_s2(motion))
 
 
 def main(folder: Path) -> None:

@@ -24,10 +24,7 @@ The single filter here has force scale and bank as states; in operation they are
 (:mod:`~pdhef_logtool.estimators.adaptive_physics`). With a filter bank, the noise would overfit to few drives.
 """
 
-from __future__ import annotations
-
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,6 +42,7 @@ from pdhef_logtool.estimators.vehicle_ukf import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.evaluation.smoothing import smooth
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.model.descent import descend
+from pdhef_logtool.model.priors import Parameter
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -122,8 +120,7 @@ def usable_stamps(signals: Signals, truth: StateTrack, vehicle: VehicleParameter
     is_complete = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
-    use: BoolArray = is_complete & moving & tame & np.isfinite(signals.steer_rad)
-    return use
+    return np.asarray(is_complete & moving & tame & np.isfinite(signals.steer_rad))
 
 
 def period_s(drive: FitDrive) -> float:
@@ -178,25 +175,13 @@ def fit_axle(
     return AxleCurve(float(np.exp(fit.x[0])), float(np.exp(fit.x[1])), float(fit.x[2]))
 
 
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
-
-    name: str
-    mean: float
-    std: float
-    log: bool = False
-    low: float | None = None
-
-    def value(self, theta: float) -> float:
-        """Return the parameter at a normalised distance from the prior."""
-        value = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
-        return value if self.low is None else max(value, self.low)
+def _prior(name: str, mean: float, std: float, *, log: bool = False, low: float = -math.inf) -> Parameter:
+    return Parameter(name, "", mean, std, low, math.inf, log)
 
 
 def make_priors(
     start: VehicleParameters, samples: Mapping[str, tuple[FloatArray, FloatArray]], usable_s: float
-) -> tuple[Prior, ...]:
+) -> tuple[Parameter, ...]:
     """Return the priors of docs/method.md#identification about a vehicle file."""
     mu, priors = start.assumed_friction, []
     for axle, (slip, force) in samples.items():
@@ -206,24 +191,24 @@ def make_priors(
         curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
         stiffness_std, peak_std, shape_std = (AXLE_FIT_SHARE * s for s in (STIFFNESS_LOG_STD, PEAK_LOG_STD, SHAPE_STD))
         priors += [
-            Prior(f"{axle} cornering stiffness", curve.stiffness_n_per_rad, stiffness_std, log=True),
-            Prior(f"{axle} peak force", curve.peak_n, peak_std, log=True),
-            Prior(f"{axle} shape", curve.shape, shape_std, low=1.0),
+            _prior(f"{axle} cornering stiffness", curve.stiffness_n_per_rad, stiffness_std, log=True),
+            _prior(f"{axle} peak force", curve.peak_n, peak_std, log=True),
+            _prior(f"{axle} shape", curve.shape, shape_std, low=1.0),
         ]
     priors += [
-        Prior("yaw inertia", start.yaw_inertia_kg_m2, 0.20, log=True),
-        Prior("roll gradient", start.roll_gradient_rad_per_m_s2, 0.3, log=True),
-        Prior("relaxation length", start.relaxation_length_m or 0.5, 0.4, log=True),
-        Prior("load sensitivity", start.load_sensitivity, 0.1, low=0.0),
-        Prior("roll frequency", start.roll_frequency_rad_s, 0.3, log=True),
-        Prior("roll damping", start.roll_damping, 0.4, log=True),
-        Prior("CG over roll axis", 0.7 * start.cg_height_m, 0.2, low=0.0),
+        _prior("yaw inertia", start.yaw_inertia_kg_m2, 0.20, log=True),
+        _prior("roll gradient", start.roll_gradient_rad_per_m_s2, 0.3, log=True),
+        _prior("relaxation length", start.relaxation_length_m or 0.5, 0.4, log=True),
+        _prior("load sensitivity", start.load_sensitivity, 0.1, low=0.0),
+        _prior("roll frequency", start.roll_frequency_rad_s, 0.3, log=True),
+        _prior("roll damping", start.roll_damping, 0.4, log=True),
+        _prior("CG over roll axis", 0.7 * start.cg_height_m, 0.2, low=0.0),
     ]
     noises = {
         "q v_y": PHYSICS_Q_STD[1], "q yaw rate": PHYSICS_Q_STD[2], "q a_x bias": 0.03, "q axle force": PHYSICS_Q_STD[4],
         "r a_y": max(0.3, start.sensors.ay_std_m_s2), "r yaw rate": start.sensors.yaw_rate_std_rad_s,
     }  # fmt: skip
-    return (*priors, *(Prior(name, mean, NOISE_LOG_STD, log=True) for name, mean in noises.items()))
+    return (*priors, *(_prior(name, mean, NOISE_LOG_STD, log=True) for name, mean in noises.items()))
 
 
 #: Entries of the vehicle file by parameter.
@@ -235,7 +220,7 @@ _ENTRIES = {
 
 
 def build_car(
-    start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
+    start: VehicleParameters, priors: Sequence[Parameter], theta: FloatArray, *, digits: int = 17
 ) -> tuple[VehicleParameters, FilterNoise]:
     """Return the vehicle file with the parameters at ``theta``, and the noise of ``physics`` that belongs to them."""
 
@@ -299,7 +284,7 @@ class PhysicsFit:
 
     vehicle: VehicleParameters
     noise: FilterNoise
-    priors: tuple[Prior, ...]
+    priors: tuple[Parameter, ...]
     theta: FloatArray
     std: FloatArray
     rms_deg: float
@@ -389,7 +374,7 @@ def read_drive(path: Path, car: Car) -> reading.WholeDrive:
         return drive.whole()
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None) -> None:
     """Simulate, fit, write."""
     parser = options("defaults.fit_physics", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=SHIPPED_CARS["saloon"], help="the car's folder")
@@ -410,8 +395,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"sideslip RMSE on what it was fitted to: {result.rms_deg:.4f} deg")
     part = Fit(physics_sha256=physics_sha256(car.vehicle), physics=physics, drives=tuple(learnt_on))
     (given.output / FIT_FILE).write_text(part_toml(part, HEAD), encoding="utf-8")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

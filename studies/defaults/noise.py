@@ -7,10 +7,8 @@ The objective is the mean over drives of ln √(RMSE² + floor²) of the sidesli
 mean in degrees: every drive counts by its relative error. The floor limits the effect of drives that hardly turn.
 """
 
-from __future__ import annotations
-
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from scipy.optimize import differential_evolution
@@ -60,9 +58,8 @@ def tune(logs: Iterable[LogInput], config: RunConfig, trials: int) -> dict[str, 
         car = identified.with_noise(TUNED, filter_noise(point(shares)))
         estimator = spec_of(TUNED).make(car, Options(options.use_speed))
         given = ((DriveSignals.of(d.signals, car).of_estimator(TUNED), d.truth) for d in drives)
-        return objective_deg(
-            [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
-        )
+        errors_rad = [error_rad(run_estimator(estimator, s), truth, slow) for s, truth in given if truth is not None]
+        return math.degrees(math.exp(float(np.mean(np.log(np.hypot(errors_rad, FLOOR_RAD))))))
 
     effort = {"popsize": GENERATION // len(LOW), "maxiter": max(1, trials // GENERATION) - 1}
     way = {"init": "sobol", "tol": 0.0, "polish": False, "seed": SEED}
@@ -91,11 +88,6 @@ def error_rad(estimate: StateTrack, truth: StateTrack, low_speed_m_s: float) -> 
     if error.size == 0:
         return zero
     return rms if error.size >= MIN_AVAILABILITY * scorable.size else max(rms, zero)
-
-
-def objective_deg(errors_rad: Sequence[float]) -> float:
-    """Return the objective over drives."""
-    return math.degrees(math.exp(float(np.mean(np.log(np.hypot(errors_rad, FLOOR_RAD))))))
 
 
 def point(shares: FloatArray) -> Point:

@@ -5,8 +5,6 @@ and friction 0.3 to 1.0, both uniform; 70 % training, 15 % validation and 15 % t
 speed and friction that the condition table holds out are excluded. Only ``pd-hef-paper`` is trained on a fishhook.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -36,11 +34,11 @@ def _draw(rng: np.random.Generator, manoeuvre: str) -> DriveSpec:
     return DriveSpec(manoeuvre, *drawn, DURATION_S, amplitude=round(amplitude, 4))
 
 
-def plan_drives(count: int = COUNT) -> list[Job]:
-    """Return the drives; a drive does not depend on their number."""
+def plan_drives() -> list[Job]:
+    """Return the drives."""
     jobs = []
     limits = np.cumsum([share for _, share in SPLITS])
-    for index in range(count):
+    for index in range(COUNT):
         rng = np.random.default_rng(np.random.SeedSequence(entropy=SEED, spawn_key=(index,)))
         split = SPLITS[int(np.searchsorted(limits[:-1], rng.uniform(), side="right"))][0]
         manoeuvre = MANOEUVRE_CYCLE[index % len(MANOEUVRE_CYCLE)]
@@ -49,7 +47,7 @@ def plan_drives(count: int = COUNT) -> list[Job]:
     return jobs
 
 
-def write_drives(folder: Path, *, count: int, processes: int) -> None:
+def write_drives(folder: Path, *, processes: int) -> None:
     """Write the drives and their manifest; drives that exist are kept."""
-    head = {"command": "python -m studies.defaults.train_default --steps simulate", "seed": SEED, "count": count}
-    run_jobs(plan_drives(count), folder, head, processes=processes)
+    head = {"command": "python -m studies.defaults.train_default --steps simulate", "seed": SEED, "count": COUNT}
+    run_jobs(plan_drives(), folder, head, processes=processes)

@@ -4,8 +4,6 @@ Drives, split, rows and recipe are those of the residual network; only the targe
 least squares of the true sideslip on low-passed features (:mod:`pdhef_logtool.residual_model.linear_model`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -9,8 +9,6 @@ the drives of :mod:`studies.defaults.paper_drives`. Filter noise of all tuned es
 in one search. Existing logs with unchanged settings are kept.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -56,8 +54,8 @@ def simulate(t: Namespace) -> None:
     t.output.mkdir(parents=True, exist_ok=True)
     text = part_toml(read_vehicle_file(SAMPLE_VEHICLE).vehicle, "Written by python -m studies.defaults.train_default.")
     (t.output / VEHICLE_FILE).write_text(f"{text}\n[network]\ngain = {GAIN}\n", encoding="utf-8")
-    write_suite(t.work / "one_car", count=t.drives, seed=SEED, processes=t.jobs)
-    paper_drives.write_drives(t.work / PAPER_DRIVES, count=min(t.drives, paper_drives.COUNT), processes=t.jobs)
+    write_suite(t.work / "one_car", count=DRIVES, seed=SEED, processes=t.jobs)
+    paper_drives.write_drives(t.work / PAPER_DRIVES, processes=t.jobs)
 
 
 def fit(t: Namespace) -> None:
@@ -69,7 +67,7 @@ def noise(t: Namespace) -> None:
     """Tune the noise of all tuned filters alike, on validation drives."""
     config = RunConfig(car=t.output, mapping=fit_physics.MAPPING)
     logs = chosen_logs([str(t.work / "one_car")], LearnSettings(config=config, split="validation"))
-    fitted = read_fit(t.output / FIT_FILE).model_copy(update={"filter": tune(logs, config, t.trials)})
+    fitted = read_fit(t.output / FIT_FILE).model_copy(update={"filter": tune(logs, config, TRIALS)})
     (t.output / FIT_FILE).write_text(part_toml(fitted, fit_physics.HEAD), encoding="utf-8")
 
 
@@ -79,17 +77,15 @@ def extract(t: Namespace) -> None:
     for drives, residuals, model in (*sets, (t.work / PAPER_DRIVES, t.work / PAPER_RESIDUALS, NOMINAL_MODEL)):
         given = ("--car", t.output, "--mapping", fit_physics.MAPPING, "--filter", model, "--jobs", t.jobs, "--resume")
         words = ("pdhef_logtool", "extract", drives, *given, "-o", residuals)
-        if subprocess.run([sys.executable, "-m", *map(str, words)], check=False).returncode not in (
-            EXIT_OK,
-            EXIT_PARTIAL,
-        ):
+        ended = subprocess.run([sys.executable, "-m", *map(str, words)], check=False)
+        if ended.returncode not in (EXIT_OK, EXIT_PARTIAL):
             raise SystemExit(f"failed: {words}")
 
 
 def train(t: Namespace) -> None:
     """Train the residual network and the baselines."""
     train_baselines(read_dataset(t.work / NOMINAL_MODEL, NOMINAL_MODEL), t.output / NETWORK_FOLDER)
-    _train(t, PHYSICS_MODEL, PHYSICS_MODEL, "", Recipe(epochs=t.epochs))
+    _train(t, PHYSICS_MODEL, PHYSICS_MODEL, "", Recipe(epochs=EPOCHS))
 
 
 def paper(t: Namespace) -> None:
@@ -108,25 +104,21 @@ STEPS: dict[str, Callable[[Namespace], None]] = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> None:
     """Train and write the car."""
     parser = options("defaults.train_default", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=HOME, help="the car's folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    parser.add_argument("--drives", type=int, default=DRIVES, help="number of drives")
-    parser.add_argument("--epochs", type=int, default=EPOCHS)
-    parser.add_argument("--trials", type=int, default=TRIALS, help="of each tuned estimator")
     parser.add_argument("--steps", nargs="+", choices=STEPS, default=list(STEPS), help="default: all")
-    given = parser.parse_args(arguments)
+    given = parser.parse_args()
     torch.set_num_threads(1)  # small networks: a second thread gains nothing
     began = time.monotonic()
     for name, step in STEPS.items():
         if name in given.steps:
             print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {name}: {step.__doc__}", flush=True)
             step(given)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -8,8 +8,6 @@ tree under test, for figures in the file and for rows missing from it. It saves 
 The tool is used by its command line and its files only.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import subprocess
@@ -123,20 +121,14 @@ def means(measured: dict[tuple[str, str], Figures], frozen: dict[Key, Frozen]) -
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the rows, and freeze or compare them."""
-    parser = options("gates", __doc__)
+    parser = options("gates", __doc__, "work", jobs=2)
     parser.add_argument("--quick", action="store_true", help="a representative part")
     parser.add_argument("--only", nargs="+", default=[], help="parts of gate/row")
     parser.add_argument("--tree", type=Path, default=ROOT, help="source tree under test")
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "gates")
     parser.add_argument("--freeze", metavar="COMMIT", help="write the figures as those of this commit")
-    parser.add_argument("--list", action="store_true", help="print the rows")
     given = parser.parse_args(arguments)
     rows = [r for r in all_rows() if r.quick or not given.quick]
     rows = [r for r in rows if not given.only or any(text in f"{r.gate}/{r.name}" for text in given.only)]
-    if given.list:
-        print("\n".join(f"{r.gate}/{r.name}" for r in rows))
-        return 0
     for row in rows:
         if absent := [str(file) for file in row.needs if not file.exists()]:
             print(f"{row.gate}/{row.name}: skipped, because {', '.join(absent)} is absent", file=sys.stderr)

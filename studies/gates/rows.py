@@ -1,8 +1,7 @@
 """The rows of the gates: each measures figures of the tool by its command line and its files."""
 
-from __future__ import annotations
-
 import math
+import re
 import subprocess
 import threading
 from collections import Counter
@@ -16,7 +15,7 @@ import numpy as np
 
 from studies.calibration import DRIVEN, errors_over_sd, true_values, wrong_file
 from studies.conditions import row_inputs, row_logs
-from studies.gates.tool import Tool, commands_and_options, coverage_percent, reports, sideslip_rmse_deg
+from studies.gates.tool import Tool, coverage_percent, reports, sideslip_rmse_deg
 from studies.mapping_mistakes import VERDICTS, outcomes
 from studies.pages import DRIVES, ROOT, SAMPLE_VEHICLE, read_json, read_toml, write_toml
 from studies.peers.drives import PEER_DRIVES, PeerDrive, mapping_table, needed_files, vehicle_table
@@ -91,7 +90,7 @@ def condition(row: str, drives: int, tool: Tool) -> Figures:
 
 
 def recorded(drive: PeerDrive, receiver: bool, tool: Tool) -> Figures:
-    """Run the estimators and the reference on a recorded drive with its published vehicle file."""
+    """Run estimators and reference on a recorded drive with its published vehicle file, which is calibrated."""
     name = f"{drive.log.partition('.')[0]}{'-gnss' if receiver else ''}"
     mapping = write_toml(tool.work / "mappings" / f"{name}.toml", mapping_table(drive, receiver=receiver))
     car = write_toml(tool.work / "cars" / f"{name}.toml", vehicle_table(drive))
@@ -100,13 +99,8 @@ def recorded(drive: PeerDrive, receiver: bool, tool: Tool) -> Figures:
     run = tool.run(f"recorded-{name}", DRIVES / drive.log, *given)
     figures = rmse_figures(run, 0.01, "physics")
     (report,) = reports(run).values()
-    return figures | parameter_figures(report)
-
-
-def parameter_figures(report: dict[str, Any]) -> Figures:
-    """Return the calibrated parameters of a report and their standard deviations, in shares of the value."""
     calibration = report["self_calibration"] or {}
-    return {
+    return figures | {
         f"{name} {p['name']}": Figure(float(p[key]), p.get("unit", "1"), absolute=0.03 * abs(float(p["sd"])))
         for p in calibration.get("parameters", ())
         for name, key in (("calibrated", "value"), ("±", "sd"))
@@ -168,8 +162,7 @@ def mistakes(log: str, kinds: Sequence[tuple[str, str]], tool: Tool) -> Figures:
     path, folder = SAMPLES / log, tool.work / "mappings"
 
     def look(log: Path, mapping: Path) -> list[dict[str, Any]]:
-        checks: list[dict[str, Any]] = tool.json("inspect", log, "--mapping", mapping)["checks"]
-        return checks
+        return list(tool.json("inspect", log, "--mapping", mapping)["checks"])
 
     found = outcomes(look, path, tool.mapping(path), folder / f"mistakes-{len(kinds)}", kinds)
     counts = Counter(outcome.verdict for outcome in found)
@@ -180,8 +173,7 @@ def written(file: Path, done: subprocess.CompletedProcess[str]) -> dict[str, Any
     """Return a JSON document that a module has written; raises RuntimeError if it has not."""
     if not file.is_file():
         raise RuntimeError(done.stderr[-2000:])
-    document: dict[str, Any] = read_json(file)
-    return document
+    return dict(read_json(file))
 
 
 # ------------------------------------------------------------------------------------------------ third-party logs
@@ -236,8 +228,11 @@ def exit_codes(tool: Tool) -> Figures:
 
 
 def options(tool: Tool) -> Figures:
-    """Return the commands and their options."""
-    return present([f"{c} {o}".strip() for c, names in commands_and_options(tool).items() for o in ("", *names)])
+    """Return the commands and their options, as ``--help`` lists them."""
+    listed = re.findall(r"^  ([a-z]+)(?: suite| conditions)?  +[A-Z]", tool.pdhef("--help").stdout, re.MULTILINE)
+    helps = {name: tool.pdhef(name, "--help").stdout for name in dict.fromkeys(listed)}
+    found = {name: set(re.findall(r"^  .*?(--[a-z-]+)", text, re.MULTILINE)) for name, text in helps.items()}
+    return present([f"{c} {o}".strip() for c, names in found.items() for o in ("", *names)])
 
 
 def files_and_keys(tool: Tool) -> Figures:

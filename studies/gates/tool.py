@@ -1,10 +1,7 @@
 """The tool under test as its users see it: the command line, and the files of a run."""
 
-from __future__ import annotations
-
 import json
 import os
-import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -51,8 +48,7 @@ class Tool:
         done = self.pdhef(*arguments, "--json")
         if done.returncode not in (0, 3, 4):
             raise RuntimeError(f"pdhef {' '.join(map(str, arguments))}: exit {done.returncode}\n{done.stderr[-2000:]}")
-        document: dict[str, Any] = json.loads(done.stdout)
-        return document
+        return dict(json.loads(done.stdout))
 
     def run(self, name: str, *arguments: str | Path) -> Path:
         """Run estimators on logs without pages; return the output folder."""
@@ -104,12 +100,3 @@ def estimates(run: Path) -> pl.DataFrame:
 def reports(run: Path) -> dict[str, dict[str, Any]]:
     """Return the report.json of every log of a run by name."""
     return {f.parent.name: read_json(f) for f in sorted(run.glob("logs/*/report.json"))}
-
-
-def commands_and_options(tool: Tool) -> dict[str, set[str]]:
-    """Return the options of each command, as ``--help`` lists them."""
-    listed = re.findall(r"^  ([a-z]+)(?: suite| conditions)?  +[A-Z]", tool.pdhef("--help").stdout, re.MULTILINE)
-    return {
-        name: set(re.findall(r"^  .*?(--[a-z-]+)", tool.pdhef(name, "--help").stdout, re.MULTILINE))
-        for name in dict.fromkeys(listed)
-    }

@@ -5,46 +5,35 @@
 The constants that the paper leaves open come from ``python -m studies.paper.constants``.
 """
 
-from __future__ import annotations
-
+import re
 import shutil
-import sys
-from pathlib import Path
 
 from pdhef_logtool.car.car import Car
 from studies.gates.tool import Tool
-from studies.pages import ROOT, page_options, read_json, write, write_json
+from studies.pages import OF_PAGES, ROOT, options, read_json, write, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
-from studies.paper.page import PAGE_FIGURES, write_page
+from studies.paper.page import write_page
 from studies.paper.results import document, gather
 
 #: Results of this command and of the constants, in the folder of results.
 STORED = ("results.json", "constants.json")
 
 
-def render(results: Path, docs: Path) -> None:
-    """Write the page from the stored results and figures of a folder."""
-    stored, constants = (read_json(results / name) for name in STORED)
-    (docs / "paper").mkdir(parents=True, exist_ok=True)
-    for name in PAGE_FIGURES:
-        shutil.copyfile(results / name, docs / "paper" / name)
-    write(docs / "paper.md", write_page(stored, constants))
-
-
-def main() -> int:
-    """Run the command line."""
-    parser = page_options("paper", __doc__)
-    parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
-    given = parser.parse_args()
+def main() -> None:
+    """Run the experiment and write the page from the stored results and figures."""
+    given = options("paper", __doc__, OF_PAGES, noise_seeds=NOISE_SEEDS).parse_args()
     if not given.stored:
         seeds = range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + given.noise_seeds)
         results = gather(Tool(ROOT, given.work.resolve()), Car.load("saloon"), noise_seeds=seeds)
         draw(results, given.results)
         write_json(given.results / STORED[0], document(results))
-    render(given.results, given.out)
-    return 0
+    page = write_page(*(read_json(given.results / name) for name in STORED))
+    (given.out / "paper").mkdir(parents=True, exist_ok=True)
+    for name in re.findall(r"\(paper/(\w+\.png)\)", page):
+        shutil.copyfile(given.results / name, given.out / "paper" / name)
+    write(given.out / "paper.md", page)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

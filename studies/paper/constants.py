@@ -1,6 +1,6 @@
 """Choose the constants that the paper leaves open by one rule on training drives, and show their sensitivity.
 
-    python -m studies.paper.constants [-o FILE]
+    python -m studies.paper.constants
 
 Rule: cyclic search over :data:`GRID`, one constant after the other, until a whole cycle changes nothing; the goal is
 the lowest geometric mean of the sideslip RMSE over :data:`COUNT` training drives of the paper's network, each with and
@@ -8,10 +8,7 @@ without the wheel speed (``sensors=esp``, the paper's sensor set). The sensitivi
 the chosen point, on these drives and on scenarios A and B, which have no part in the choice.
 """
 
-from __future__ import annotations
-
 import itertools
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -28,7 +25,7 @@ from pdhef_logtool.estimators.vehicle_ukf import nominal_filter
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.defaults.paper_drives import plan_drives
-from studies.pages import RESULTS, options, write_json
+from studies.pages import RESULTS, options, read_toml, write_json
 from studies.paper.experiment import FIRST_NOISE_SEED, SCENARIO_PAIR, as_logged, on_the_road, paper_network
 from truthsim.drive import Drive, simulate_drive
 
@@ -38,17 +35,10 @@ COUNT, NOISE_SEEDS = 12, 5
 SENSOR_SETS = {"wheel speed": True, "esp": False}
 
 
-def _tops(low: float, middle: float, high: float) -> tuple[tuple[float, float, float], ...]:
-    return tuple((f * low, f * middle, f * high) for f in (0.1, 0.25, 0.5, 1.0, 2.0))
-
-
-#: Values of each constant; the paper requires θ in (0, 1] and, as Q is inflated, γ above 0.
+#: Values of each constant.
 GRID: Mapping[str, Sequence[Any]] = {
-    "forgetting": (0.9, 0.95, 0.99, 0.999, 1.0),
-    "process_noise_gain": (0.1, 0.3, 1.0, 3.0, 10.0),
-    "deviation_tops_m_s2": _tops(0.3, 1.0, 2.5),
-    "intensity_tops": _tops(0.3, 0.6, 0.85),
-    "ay_variance": (0.1, 0.3, 1.0, 3.0),
+    name: [tuple(value) if isinstance(value, list) else value for value in values]
+    for name, values in read_toml(Path(__file__).with_suffix(".toml")).items()
 }
 #: First point of the search.
 START = Constants(0.95, 3.0, (0.3, 1.0, 2.5), (0.3, 0.6, 0.85), 0.1)
@@ -127,11 +117,9 @@ def sensitivity(chosen: Constants, goals: Mapping[str, Goal]) -> list[dict[str, 
     return rows
 
 
-def main() -> int:
+def main() -> None:
     """Run the command line."""
-    parser = options("paper.constants", __doc__)
-    parser.add_argument("-o", "--output", type=Path, default=FILE)
-    arguments = parser.parse_args()
+    options("paper.constants", __doc__).parse_args()
     car = Car.load("saloon")
     training = goal_of(cases_of(training_drives(), car))
     chosen = choose(training)
@@ -151,9 +139,8 @@ def main() -> int:
                   "errors_deg": {title: goal(START) for title, goal in goals.items()}},
                  *sensitivity(chosen, goals)],
     }  # fmt: skip
-    write_json(arguments.output, document)
-    return 0
+    write_json(FILE, document)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -3,8 +3,6 @@
 The runs get the friction of the drive. Noise seeds change the sensors alone.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -26,7 +24,7 @@ from studies.gates.tool import Tool, estimates, metrics
 from studies.paper.schemes import ESP, SCHEMES
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
-from truthsim.manoeuvres import MANOEUVRES
+from truthsim.manoeuvres import MANOEUVRES, Manoeuvre
 
 #: Sensor errors of the reported drives. No training or tuning set has these seeds: sample logs have seeds of one digit,
 #: the sets of the shipped car are drawn from seeds 1000 to 4000.
@@ -36,7 +34,7 @@ NOISE_SEEDS = 5
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """One manoeuvre of the paper at its default speed and friction; ``faults`` as the command line has them."""
+    """One manoeuvre of the paper; ``faults`` as the command line has them."""
 
     name: str
     manoeuvre: str
@@ -44,14 +42,9 @@ class Scenario:
     faults: tuple[str, ...] = ()
 
     @property
-    def speed_km_h(self) -> float:
-        """Speed of the manoeuvre."""
-        return MANOEUVRES[self.manoeuvre].speed_km_h
-
-    @property
-    def friction(self) -> float:
-        """Friction of the road."""
-        return MANOEUVRES[self.manoeuvre].friction
+    def driven(self) -> Manoeuvre:
+        """Manoeuvre of the simulator, with its speed and the friction of the road."""
+        return MANOEUVRES[self.manoeuvre]
 
 
 #: The burst covers both lane changes of A.

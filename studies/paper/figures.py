@@ -1,7 +1,5 @@
 """The pictures of Figures 9 to 23 with our data, in the colours that estimators have everywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

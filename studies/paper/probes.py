@@ -1,7 +1,5 @@
 """Quantities of Figures 10, 19 to 21 and 23: residuals, adaptation of R, residual gain, time of a step."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 """Everything that the page and the pictures need, gathered once, and as one JSON document."""
 
-from __future__ import annotations
-
-import math
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
@@ -52,24 +50,19 @@ def gather(tool: Tool, car: Car, *, noise_seeds: Sequence[int]) -> Results:
     """Run the whole experiment."""
     experiment = paper.run_experiment(tool, scenarios=SCENARIOS, noise_seeds=noise_seeds)
     pair = paper.SCENARIO_PAIR
-    drives = {s.name: paper.read_log(experiment.logs[s.name], paper.on_the_road(car, s.friction)) for s in pair}
+    drives = {s.name: paper.read_log(experiment.logs[s.name], paper.on_the_road(car, s.driven.friction)) for s in pair}
     fits = {name: residual_fit(whole, car) for name, whole in drives.items()}
     curves = {s.name: trust_curve(experiment, s.name, PAPER) for s in pair}
     inflations = {name: inflation(experiment, name, paper.BURST_S) for name in ADAPTIVE}
     names = [n for n in SCHEMES if not n.endswith(ESP)]
-    times = step_times(drives[paper.B.name], paper.on_the_road(car, paper.B.friction), names)
+    times = step_times(drives[paper.B.name], paper.on_the_road(car, paper.B.driven.friction), names)
     return Results(experiment, car, fits, curves, inflations, times)
 
 
-def _plain(value: Any) -> Any:
-    """Return JSON-able values: floats to six digits, null for non-finite ones."""
-    if isinstance(value, float):
-        return float(f"{value:.6g}") if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value
+def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a document with floats of six digits, null for non-finite ones."""
+    text = json.dumps(document)
+    return dict(json.loads(text, parse_float=lambda x: float(f"{float(x):.6g}"), parse_constant=lambda _: None))
 
 
 def document(r: Results) -> dict[str, Any]:
@@ -97,10 +90,10 @@ def document(r: Results) -> dict[str, Any]:
         scenario: {PAPER: {"centre_g": c.centre_g.tolist(), "median": c.median.tolist(), "mean": float(c.trust.mean())}}
         for scenario, c in r.curves.items()
     }
-    plain: dict[str, Any] = _plain(
+    return _plain(
         {
             "made_by": "python -m studies.paper",
-            "scenarios": [{**asdict(s), "speed_km_h": s.speed_km_h, "friction": s.friction} for s in SCENARIOS],
+            "scenarios": [asdict(s) | {n: getattr(s.driven, n) for n in ("speed_km_h", "friction")} for s in SCENARIOS],
             "vehicle": {"name": r.car.vehicle.name, "sha256": r.car.physics_sha256},
             "networks": [n.sha256 for n in (network, network and network.paper_network) if n is not None],
             "losses": r.losses,
@@ -115,4 +108,3 @@ def document(r: Results) -> dict[str, Any]:
             "step_time_us": r.times,
         }
     )
-    return plain

@@ -8,8 +8,6 @@ page is written; without these drives, nothing is done. Otherwise the table is p
 vehicle file and the same mapped and aligned signals; ground truth is used for scores only.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -23,7 +21,7 @@ from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.drive.options import OFF
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.tracks import StateTrack
-from studies.pages import DRIVES, page_options, read_json, update, write_json
+from studies.pages import DRIVES, OF_PAGES, options, read_json, update, write_json
 from studies.peers.drives import OFFSET, PEER_DRIVES, REFERENCE, PeerDrive, mapping_of, mapping_table, vehicle_of
 from studies.peers.page import CAUSAL, NO_FILE, SEDAN, blocks, estimator_table
 from studies.peers.scoring import Entry, scores
@@ -108,7 +106,7 @@ def _recorder(drive: PeerDrive) -> tuple[object, ...]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Score all estimators; print the tables of logs that are given, or write page and results."""
-    parser = page_options("peers", __doc__)
+    parser = options("peers", __doc__, OF_PAGES)
     parser.add_argument("--folder", type=Path, help="logs with ground truth")
     parser.add_argument("--published", type=Path, nargs="+", default=[], metavar="CSV", help="of arXiv:2408.15610")
     parser.add_argument("--car", type=Path, help="car folder or vehicle.toml of --folder")

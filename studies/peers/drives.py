@@ -1,7 +1,5 @@
 """The recorded drives with ground truth: car, mapping and vehicle file of each, all without use of ground truth."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,10 +1,9 @@
 """Tables of the scores of recorded drives, and of the agreement of calibrated parameters between drives of a car."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,8 @@ import polars as pl
 
 from pdhef_logtool.evaluation.statistics import pooled
 from pdhef_logtool.evaluation.track_errors import NORMAL_95
-from studies.pages import number, table
+from pdhef_logtool.records.signals import BoolArray
+from studies import pages
 from studies.peers.drives import FULL_SIZE, OFFSET, PEER_DRIVES, SMALL, PeerDrive, vehicle_of
 
 SEDAN, CAUSAL, NO_FILE = "open-loop-sedan", "pd-hef, causal", "pd-hef, no file"
@@ -32,30 +32,34 @@ OF_CAR = (
 
 def blocks(rows: pl.DataFrame, parameters: Sequence[dict[str, Any]]) -> dict[str, str]:
     """Return the parts of the page by name."""
-    full, small, offset = (rows.filter(group=group) for group in (FULL_SIZE, SMALL, OFFSET))
-    means = dict(car_means(full).select("estimator", "mean_deg").iter_rows())
-    best = min(PUBLISHED, key=lambda name: means[name])
-    verdict = (
-        f"Geometric mean over {full['car'].n_unique()} full-size cars: `pd-hef` {number(means['pd-hef'], 2)}°, "
-        f"lowest of the peers `{best}` {number(means[best], 2)}°."
+    groups = {name: rows.filter(group=name) for name in (FULL_SIZE, SMALL, OFFSET)}
+    means = dict(car_means(groups[FULL_SIZE]).select("estimator", "mean_deg").iter_rows())
+    return pages.blocks(
+        __file__,
+        cars=groups[FULL_SIZE]["car"].n_unique(),
+        means=means,
+        best=min(PUBLISHED, key=lambda name: means[name]),
+        names=(*PUBLISHED, *OURS),
+        ours=OURS,
+        estimators={name: estimator_table(of) for name, of in groups.items()},
+        logs={name: _by_log(of) for name, of in groups.items()},
+        parameters=agreements(parameters),
+        ratio=_ratio,
+        marked=MARKED,
     )
-    removed = offset.filter(estimator="zero").select("log", "offset_deg").iter_rows()
-    offsets = ", ".join(f"{_stem(log)} {number(offset_deg, 2)}°" for log, offset_deg in removed)
-    return {
-        "verdict": verdict,
-        "full_size": estimator_table(full),
-        "full_size_drives": drives_table(full),
-        "intervals": intervals_table(full),
-        "parameters": pairs_table(parameters),
-        "small": estimator_table(small),
-        "small_drives": drives_table(small),
-        "offsets": f"Medians of the sideslip on straights: {offsets}.",
-        "offset_drives": drives_table(offset),
-    }
 
 
-def _stem(log: str) -> str:
-    return log.partition(".")[0]
+def _by_log(rows: pl.DataFrame) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the rows of each log by estimator, in the order of the tables."""
+    logs = rows["log"].unique(maintain_order=True)
+    found = {log: {row["estimator"]: row for row in rows.filter(log=log).iter_rows(named=True)} for log in logs}
+    return {log.partition(".")[0]: {n: of[n] for n in (*PUBLISHED, *OURS) if n in of} for log, of in found.items()}
+
+
+def _ratio(of_log: Mapping[str, dict[str, Any]]) -> float:
+    """Return the error of `pd-hef` over the median of the best peers."""
+    peers = sorted(of_log[name]["rmse_deg"] for name in PUBLISHED if name in of_log)[:BEST_PEERS]
+    return float(of_log["pd-hef"]["rmse_deg"] / np.median(peers))
 
 
 def car_means(rows: pl.DataFrame) -> pl.DataFrame:
@@ -74,65 +78,30 @@ def car_means(rows: pl.DataFrame) -> pl.DataFrame:
 def estimator_table(rows: pl.DataFrame) -> str:
     """Return a line for each estimator, the lowest error of `zero` first."""
     zero, means = rows.filter(estimator="zero").select("log", of_zero="rmse_deg"), car_means(rows)
-    lines = []
+    estimators = []
     for (name,), own in rows.join(zero, on="log").group_by("estimator", maintain_order=True):
         weights, values, others = (own[c].to_numpy() for c in ("scored_s", "rmse_deg", "of_zero"))
         factors = {factor: own[factor].to_list() for factor in ("car", "drive")}
         error = pooled(weights, values, None, squares=True, positive=True, factors=factors)
         ratio = float(np.sqrt(np.average(values**2, weights=weights) / np.average(others**2, weights=weights)))
-        share, covers, winkler, cost = (
-            float(np.average(own[c].to_numpy(), weights=weights))
-            for c in ("available", "coverage95", "winkler_deg", "seconds_per_hour")
-        )
-        mean, spread = means.filter(estimator=name).row(0)[1:]
-        cells = [str(len(own)), number(error.value, 2), f"{number(error.low, 2)} to {number(error.high, 2)}"]
-        cells += [number(x, 2) for x in (ratio, mean, spread)]
-        cells += [f"{share:.0%}", number(covers, 2), number(winkler, 2), number(cost, 1)]
-        lines.append((ratio, [f"`{name}`", *cells]))
-    head = "estimator, drives, RMSE, 95 %, of zero, mean of cars, spread, available, covers, Winkler, s/h"
-    return table(head, [cells for _, cells in sorted(lines)], right_from=1)
+        about = {"name": name, "drives": len(own), "error": error, "ratio": ratio}
+        averages = ("available", "coverage95", "winkler_deg", "seconds_per_hour")
+        about |= {c: float(np.average(own[c].to_numpy(), weights=weights)) for c in averages}
+        estimators.append(about | means.filter(estimator=name).row(0, named=True))
+    return pages.template(Path(__file__).with_name("estimators"), estimators=estimators).rstrip("\n")
 
 
-def drives_table(rows: pl.DataFrame) -> str:
-    """Return the errors, a line a drive; the lowest one is bold, one of an incomplete estimate marked."""
-    body = []
-    for (log,), own in rows.group_by("log", maintain_order=True):
-        found = {name: (error, share) for name, error, share in own["estimator", "rmse_deg", "available"].iter_rows()}
-        shown = [name for name in (*PUBLISHED, *OURS) if name in found]
-        lowest, cells = min(shown, key=lambda name: found[name][0]), []
-        for name in (*PUBLISHED, *OURS):
-            error, share = found.get(name, (math.nan, 1.0))
-            text = number(error, 2) + ("†" if 1.0 - share > MARKED else "")
-            cells.append(f"**{text}**" if name == lowest else text)
-        peers = sorted(found[name][0] for name in PUBLISHED if name in found)[:BEST_PEERS]
-        body.append([f"`{_stem(str(log))}`", *cells, number(found["pd-hef"][0] / float(np.median(peers)), 2)])
-    return table(["drive", *(f"`{name}`" for name in (*PUBLISHED, *OURS)), "ratio"], body, right_from=1)
+def agreements(documents: Sequence[dict[str, Any]]) -> Iterator[tuple[str, BoolArray, float]]:
+    """Yield how parameters of pairs of drives of one car agree: within 1.96 sd [pairs], RMS of differences over sd.
 
-
-def intervals_table(rows: pl.DataFrame) -> str:
-    """Return coverage and half-width of the 95 % intervals, a line a drive."""
-    body = []
-    for (log,), own in rows.group_by("log", maintain_order=True):
-        found = {name: f"{share:.0%}, {number(half, 2)}"
-                 for name, share, half in own["estimator", "coverage95", "half_width_deg"].iter_rows()}  # fmt: skip
-        body.append([f"`{_stem(str(log))}`", *(found.get(name, "–") for name in OURS)])
-    return table(["drive", *(f"`{name}`" for name in OURS)], body, right_from=1)
-
-
-def pairs_table(documents: Sequence[dict[str, Any]]) -> str:
-    """Return how parameters of pairs of drives of one car agree, a line a parameter and one for all of them.
-
-    Two logs of the same drive are no pair.
+    One for each parameter and one for all. Two logs of the same drive are no pair.
     """
     fitted = {d["log"]: {p["name"]: p for p in d["parameters"]} for d in documents}
     drives = [drive for drive in PEER_DRIVES if drive.log in fitted]
     pairs = [(a, b) for a, b in combinations(drives, 2) if a.car == b.car and a.drive != b.drive]
     every = {name: np.array([_difference(name, a, b, fitted) for a, b in pairs]) for name in OF_CAR}
-    body = []
     for name, rows in [*every.items(), ("all", np.concatenate(list(every.values())))]:
-        within, rms = np.abs(rows) <= NORMAL_95, number(float(np.sqrt(np.mean(rows**2))), 2)
-        body.append([name, str(len(rows)), f"{np.mean(within):.0%}", rms])
-    return table(["parameter", "pairs", "within 1.96 σ", "RMS of difference / σ"], body, right_from=1)
+        yield name, np.abs(rows) <= NORMAL_95, float(np.sqrt(np.mean(rows**2)))
 
 
 def _difference(name: str, a: PeerDrive, b: PeerDrive, fitted: Mapping[str, Mapping[str, dict[str, Any]]]) -> float:

@@ -1,7 +1,5 @@
 """Scores of all estimators on a drive with ground truth."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping as Table
 from dataclasses import dataclass, field

@@ -6,8 +6,6 @@
 layouts that were built last: its groups, by default ``held-out``. Exit code 1: something is wrong and not reported.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections import Counter
@@ -15,10 +13,10 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
-from studies.pages import DOCS, RESULTS, ROOT, options, read_json, read_toml, write, write_json
+from studies.pages import DOCS, RESULTS, options, read_json, read_toml, write, write_json
 from studies.strangers.containers import write as write_log
 from studies.strangers.layouts import layouts, mountings
-from studies.strangers.page import OUTCOMES, Result, merged, page
+from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import ANSWERS, SHARED, look, other_recording, score_log
 
@@ -48,27 +46,20 @@ def score_others(only: Sequence[str]) -> Iterator[Result]:
             yield score_log(SHARED / file, other_recording(file))
 
 
-def first_run() -> str:
-    """Return the figures of the completed first runs of held-out layouts."""
-    said = ""
+def first_runs() -> Iterator[tuple[int, str, Counter[str]]]:
+    """Yield number, description and outcomes of the held-out layouts of each completed first run."""
     for name, what in FIRST_RUNS.items():
         file = RESULTS / "third_party_logs" / f"{name}_first_run.json"
         if file.is_file():
             logs = read_json(file)
-            ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
-            rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
-            said += (
-                f"The {len(logs)} {what}. In their first run, {ends['right']} of {ends.total()} items were "
-                f"right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
-            )
-    return said and f"{said}The tables contain a later run, after corrections of the causes.\n\n"
+            yield len(logs), what, Counter(outcome for log in logs.values() for outcome in log["items"].values())
 
 
-def others_without_answers() -> str:
-    """Return the mapped channels of the recordings in ``reader_corpus`` without vehicle signals."""
+def others_without_answers() -> tuple[int, list[str]] | None:
+    """Return number and mapped channels of the recordings in ``reader_corpus`` without vehicle signals, if there."""
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
-        return ""
+        return None
     channels = {name for names in ITEMS.values() for name in names}
     mapped_files, count = [], 0
     for entry in read_json(catalogue):
@@ -81,8 +72,7 @@ def others_without_answers() -> str:
         if taken:
             most = max(taken.values())
             mapped_files.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
-    said = f"Channels are mapped in {'; '.join(mapped_files)}." if mapped_files else "No channel is mapped in them."
-    return f"{count} further recordings of `reader_corpus` contain no vehicle signals. {said}\n"
+    return count, mapped_files
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:
@@ -91,10 +81,9 @@ def _wanted(name: str, only: Sequence[str]) -> bool:
 
 def main() -> int:
     """Make the logs, score them, write the page."""
-    parser = options("strangers", __doc__)
+    parser = options("strangers", __doc__, "work")
     parser.add_argument("--only", nargs="+", default=[], help="parts of names of logs")
     parser.add_argument("--held-out", nargs="*", metavar="GROUP", help="with layouts that were built last")
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "strangers", help="folder for the logs")
     parser.add_argument("--out", type=Path, default=DOCS / "third_party_logs.md", help="the page")
     parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
     given = parser.parse_args()
@@ -110,8 +99,8 @@ def main() -> int:
         for result in chain.from_iterable(kinds.values()):
             _show(result)
     else:
-        remark = first_run() + ("" if last else "Without the held-out layouts.\n\n")
-        write(given.out, page(results, remark + others_without_answers()))
+        about = {"first_runs": [*first_runs()], "corpus": others_without_answers(), "is_complete": bool(last)}
+        write(given.out, page(results, **about))
     if given.keep:
         write_json(given.keep, {r.log.name: r.as_json() for r in sorted(results, key=lambda r: r.log.name)})
     return 1 if any(r.count("wrong, not reported") for r in results) else 0

@@ -3,8 +3,6 @@
 A topic is a message, its type the bus. Every field takes 16 bits, from the first byte on.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import shutil
 from collections.abc import Sequence
@@ -75,26 +73,17 @@ def _mdf(frames: Sequence[_Frame], path: Path) -> None:
 
 def _mcap(frames: Sequence[_Frame], databases: dict[str, str], path: Path) -> Path:
     """Write a topic of frames for each bus, and the DBC files as attachments."""
-    from pdhef_logtool.logs.drive_log import Columns
-    from pdhef_logtool.logs.writer import McapLogWriter
-    from studies.strangers.containers import definition
+    from studies.strangers.containers import write_mcap
 
-    path = path.with_suffix(".mcap")
-    with McapLogWriter(path) as writer:
-        batches = []
-        for number, (name, text) in enumerate(databases.items()):
-            mine = [frame for frame in frames if frame[1] == number]
-            stamps = np.array([t for t, *_ in mine])
-            data = np.frombuffer(b"".join(d for *_, d in mine), np.uint8).reshape(-1, 8)
-            fields = {"header.stamp": stamps, "id": np.array([i for _, _, i, _ in mine]), "data": data}
-            topic = f"/{name}/received_messages"
-            writer.add_topic(
-                topic, "can_msgs/msg/Frame", constants={"dlc": 8.0}, definition=definition("can_msgs/msg/Frame")
-            )
-            batches.append(Columns(topic, stamps, stamps, fields))
-            writer.attachment(Attachment(int(stamps[0]), int(stamps[0]), f"{name}.dbc", "text/plain", text.encode()))
-        writer.write(batches)
-    return path
+    topics, files = [], []
+    for number, (name, text) in enumerate(databases.items()):
+        mine = [frame for frame in frames if frame[1] == number]
+        stamps = np.array([t for t, *_ in mine])
+        data = np.frombuffer(b"".join(d for *_, d in mine), np.uint8).reshape(-1, 8)
+        fields = {"header.stamp": stamps, "id": np.array([i for _, _, i, _ in mine]), "data": data}
+        topics.append(Topic(f"/{name}/received_messages", "can_msgs/msg/Frame", stamps, stamps, fields, {"dlc": 8.0}))
+        files.append(Attachment(int(stamps[0]), int(stamps[0]), f"{name}.dbc", "text/plain", text.encode()))
+    return write_mcap(topics, path, files)
 
 
 def write(kind: str, topics: Sequence[Topic], path: Path) -> Path:

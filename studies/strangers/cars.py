@@ -1,7 +1,5 @@
 """Sensor readings of a simulated car, in SI units and ISO 8855 axes: the right answers of every log made here."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -24,24 +22,24 @@ class Series:
     arrival_ns: IntArray
     values: FloatArray
 
-    def __getitem__(self, column: int | tuple[int, ...]) -> Series:
+    def __getitem__(self, column: int | tuple[int, ...]) -> "Series":
         """Return one column, or some in a new order."""
         return Series(self.stamps_ns, self.arrival_ns, self.values[:, column])
 
-    def times(self, factor: float | FloatArray, offset: float = 0.0) -> Series:
+    def times(self, factor: float | FloatArray, offset: float = 0.0) -> "Series":
         """Return it in another unit, sign or rotation (a matrix [k, k] that turns each row)."""
         turned = self.values @ factor.T if isinstance(factor, np.ndarray) else factor * self.values
         return Series(self.stamps_ns, self.arrival_ns, np.asarray(turned + offset))
 
-    def late(self, seconds: float) -> Series:
+    def late(self, seconds: float) -> "Series":
         """Return the values as if they had been measured later than they were."""
         return Series(self.stamps_ns + round(seconds * 1e9), self.arrival_ns + round(seconds * 1e9), self.values)
 
-    def every(self, n: int) -> Series:
+    def every(self, n: int) -> "Series":
         """Return each n-th sample."""
         return Series(self.stamps_ns[::n], self.arrival_ns[::n], self.values[::n])
 
-    def along(self, clock: Series) -> Series:
+    def along(self, clock: "Series") -> "Series":
         """Return it at another series' times: one message with several sensors."""
         clock_s, have = clock.stamps_ns * 1e-9, self.stamps_ns * 1e-9
         columns = self.values if self.values.ndim == 2 else self.values[:, None]
@@ -79,27 +77,14 @@ class Car:
     wheel_radius_m: float
     sensors: Mapping[str, Series]
 
-    def __getattr__(self, name: str) -> Series:
+    def __getattr__(self, name: str) -> "Series":
         """Return a sensor or a quantity."""
         if name not in self.sensors:
             raise AttributeError(name)
         return self.sensors[name]
 
 
-_DRIVES = read_toml(Path(__file__).with_name("drives.toml"))
-#: Channel of the simulator and its columns, by the name in :class:`Car`.
-_SENSORS = {
-    "force": ("imu", "ax_m_s2", "ay_m_s2", "az_m_s2"),
-    "rate": ("imu", "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
-    "steer": ("steering", "steer_rad"),
-    "steering_wheel": ("steering", "steering_wheel_rad"),
-    "wheels": ("wheels", "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
-    "position": ("rtk", "x_m", "y_m", "z_m"),
-    "attitude": ("rtk", "roll_rad", "pitch_rad", "yaw_rad"),
-    "body_velocity": ("rtk", "vx_m_s", "vy_m_s"),
-    "yaw_rate": ("rtk", "yaw_rate_rad_s"),
-    "fix": ("fix", "lat_deg", "lon_deg", "alt_m"),
-}
+_DRIVES, _SENSORS = (read_toml(Path(__file__).with_name(f"{name}.toml")) for name in ("drives", "sensors"))
 
 
 @lru_cache(maxsize=16)

@@ -1,7 +1,5 @@
 """Topics as columns into the containers and encodings that recorders leave."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -11,6 +9,8 @@ from functools import lru_cache, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
+
+from mcap.records import Attachment
 
 from pdhef_logtool.logs.container import ChannelRecord, RawMessage, block_of
 from pdhef_logtool.logs.drive_log import Columns
@@ -84,7 +84,8 @@ def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
 # ------------------------------------------------------------------------------------------------ ROS
 
 
-def _mcap(topics: Sequence[Topic], path: Path) -> Path:
+def write_mcap(topics: Sequence[Topic], path: Path, attachments: Iterable[Attachment] = ()) -> Path:
+    """Write topics as ROS 2 messages in MCAP; return the path."""
     path = path.with_suffix(".mcap")
     with McapLogWriter(path) as writer:
         joints = [t for t in topics if t.type_name == "sensor_msgs/msg/JointState"]
@@ -92,6 +93,8 @@ def _mcap(topics: Sequence[Topic], path: Path) -> Path:
             if topic not in joints:
                 text = definition(topic.type_name)
                 writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
+        for attachment in attachments:
+            writer.attachment(attachment)
         raws = [message for topic in joints for message in _joints(writer, topic)]
         batches = [Columns(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics if t not in joints]
         writer.write(batches, [block_of(raws)])
@@ -115,7 +118,7 @@ def _joints(writer: McapLogWriter, topic: Topic) -> Iterator[RawMessage]:
 def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
     """Yield topic, arrival, stamp and the bytes of every message, in CDR or as ROS 1 has them, as they arrive."""
     by_name = {t.name: t for t in topics}
-    scratch = _mcap(topics, path.with_name(f".{path.stem}-scratch"))
+    scratch = write_mcap(topics, path.with_name(f".{path.stem}-scratch"))
     store = _store(False)
     try:
         for m in messages(scratch):
@@ -247,7 +250,7 @@ def _add_message(message: Any, full_name: str, example: Mapping[str, Any]) -> No
 
 
 _WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
-    "mcap": _mcap,
+    "mcap": write_mcap,
     "mcap-ros1": _mcap_ros1,
     "mcap-json": _json,
     "mcap-json-bare": partial(_json, bare=True),

@@ -1,7 +1,5 @@
 """Logs with faults, and logs in the layouts of published message definitions and exports: ``layouts.txt``."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A log with its right answers, and the messages that most logs here are made of."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Compare the mapping and messages of the tool with the right answers by value, independent of field names."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from contextlib import closing
@@ -173,7 +171,8 @@ def score_log(path: Path, expected: Recording, start_ns: int | None = None) -> R
     """
     right = expected.right
     mapping, messages, channels = look(path)
-    sources = {} if mapping is None else _sources(mapping)
+    sides = {} if mapping is None else mapping.signals | {f"truth.{n}": s for n, s in mapping.truth.items()}
+    sources = {name: source.label for name, source in sides.items()}
     fitting = {**expected.allowed, **right}
     first = min((int(c.arrival_ns[0]) for c in channels.values() if len(c)), default=None)
     if start_ns is not None and first is not None and first < RELATIVE_NS + FEWEST_WEEKS_NS:
@@ -214,11 +213,6 @@ def score_log(path: Path, expected: Recording, start_ns: int | None = None) -> R
     named = bool(re.search(expected.cause, messages.text, re.IGNORECASE)) if expected.cause else None
     found = tuple(silent), tuple(doubted), alarms, named, messages.text
     return Result(replace(expected, right={}, allowed={}, topics=()), items, wrong, verdicts, *found)
-
-
-def _sources(mapping: SignalMapping) -> dict[str, str]:
-    truth = {f"truth.{name}": source for name, source in mapping.truth.items()}
-    return {name: source.label for name, source in (mapping.signals | truth).items()}
 
 
 def _is_told(name: str, sources: Mapping[str, str], messages: Told) -> bool:

@@ -3,8 +3,6 @@
 A field is named as its column, with the unit in brackets: ``Lateral Acc. [g]``.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence

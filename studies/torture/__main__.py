@@ -3,13 +3,12 @@
     python -m studies.torture [PART ...] [--work out/torture] [--seed 1] [--logs 200000] [--drives 24] [--kills 20]
                               [--count 500] [--format blf ...] [--hours 10] [--jobs 2] [--out docs]
 
-Parts: bombs, shared, mutations, formats, crashes, hours; all without one.
+Parts: bombs, shared, mutations, formats, crashes, hours; all without one. ``--logs``: mutated recordings; ``--count``:
+mutants of each other format; ``--drives`` and ``--kills``: of the crashes.
 
 Resumable: results in the work folder are not computed again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
 """
-
-from __future__ import annotations
 
 import argparse
 import shutil
@@ -24,7 +23,7 @@ from typing import Any
 
 from pdhef_logtool.workers.supervisor import Limits
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
-from studies.pages import DOCS, ROOT, options, read_json, table, update, write_json
+from studies.pages import ROOT, blocks, options, read_json, update, write_json
 from studies.torture.bombs import BOMBS, former_cases, judge_bomb
 from studies.torture.crashes import crash_cases
 from studies.torture.mutants import HANG_S, format_judge, log_judge
@@ -99,63 +98,25 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-# ------------------------------------------------------------------------------------------------ the page
-
-
-def _list(rows: list[dict[str, Any]]) -> str:
-    """Return a line for each case, with its costs."""
-    costs = [key for key in rows[0] if key not in ("name", "end", "problem")]
-    body = [
-        [r["name"], r["end"] + (f", **wrong**: {_cell(r['problem'])}" if r["problem"] else ""),
-         *(_cost(key, r[key]) if key in r else "–" for key in costs)]
-        for r in rows
-    ]  # fmt: skip
-    return table(["case", "ended", *("MiB" if key == "bytes" else key for key in costs)], body, right_from=2)
-
-
-def _cost(key: str, value: float) -> str:
-    return f"{value:.1f}" if key == "s" else f"{int(value) >> 20 if key == 'bytes' else value:.0f}"
-
-
-def _cell(text: str) -> str:
-    return " ".join(text.split())[-200:].replace("|", "/")
-
-
 _ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", NO_VERDICT)
 
 
-def _mutations(collected: dict[str, Any]) -> str:
-    rows = []
-    for name, r in collected.items():
-        ends: Counter[str] = Counter()
-        for end, n in r["ends"].items():
-            ends[end.partition(",")[0]] += n
-        counted = [ends[k] for k in _ENDS]
-        counts = [f"{n:,}" for n in (r["count"], *counted, r["count"] - sum(counted))]
-        rows.append([name, str(r["seed"]), *counts, f"{r['slowest_s']:.1f}", str(r["peak_bytes"] >> 20)])
-    text = table(["what", "seed", "cases", *_ENDS, "other", "slowest s", "peak MiB"], rows, right_from=1)
-    wrong = [(name, *p) for name, r in collected.items() for p in r["problems"]]
-    if wrong:
-        text += "\n\nWrong, by number:\n\n" + "\n".join(f"- {n} {i}: `{_cell(p)}`" for n, i, p in wrong[:40])
-    return text
+def _counts(judged_kind: Mapping[str, Any]) -> list[int]:
+    """Return the number of cases of a kind, with each of the usual ends, and with others."""
+    ends: Counter[str] = Counter()
+    for end, n in judged_kind["ends"].items():
+        ends[end.partition(",")[0]] += n
+    counted = [ends[k] for k in _ENDS]
+    return [judged_kind["count"], *counted, judged_kind["count"] - sum(counted)]
 
 
 def main() -> int:
     """Run the parts that are not done, and write the page."""
-    parser = options("torture", __doc__)
-    parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--logs", type=int, default=200_000)
-    parser.add_argument("--drives", type=int, default=24, help="simulated drives of the crashes")
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--hours", type=float, default=10.0)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--count", type=int, default=500, help="mutants of each table and CAN format")
+    numbers = {"seed": 1, "logs": 200_000, "drives": 24, "kills": 20, "hours": 10.0, "jobs": 2, "count": 500}
+    parser = options("torture", __doc__, "work out", **numbers)
     parser.add_argument("--format", action="append", choices=FORMATS, help="a table or CAN format; may be given again")
     parser.add_argument("parts", nargs="*", help="parts; all without one")
-    parser.add_argument("--out", type=Path, default=DOCS, help="folder of the page")
     given = parser.parse_args()
-    parts: list[str] = given.parts
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
     lengths = product((1.0, given.hours), (("inspect",), _THREE))
@@ -168,21 +129,17 @@ def main() -> int:
         "crashes": lambda: one_by_one("crashes", work, crash_cases(work, given.drives, given.kills, given.seed)),
         "hours": lambda: one_by_one("hours", work, hours),
     }
-    if unknown := set(parts) - set(todo):
+    if unknown := set(given.parts) - set(todo):
         parser.error(f"expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
         again = name == "formats" and given.format
-        if (again or not kept.is_file()) and (not parts or name in parts):
+        if (again or not kept.is_file()) and (not given.parts or name in given.parts):
             write_json(kept, (read_json(kept) if again and kept.is_file() else {}) | do() if again else do())
         if kept.is_file():
             results[name] = read_json(kept)
-    counts = f"--logs {given.logs} --count {given.count}"
-    counts += f" --drives {given.drives} --kills {given.kills} --hours {given.hours:g}"
-    tables = {name: (_list if isinstance(r, list) else _mutations)(r) for name, r in results.items() if r}
-    asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
-    update(given.out, "reliability.md", tables | asked)
+    update(given.out, "reliability.md", blocks(__file__, results=results, given=given, ends=_ENDS, counts=_counts))
     rows = [r for part in results.values() for r in (part if isinstance(part, list) else part.values())]
     return int(any(r.get("problem") or r.get("problems") for r in rows))
 

@@ -3,8 +3,6 @@
 Each must end within the limits of :mod:`studies.torture.workers` and with one of the exit codes that it names.
 """
 
-from __future__ import annotations
-
 import bz2
 import json
 import os
@@ -20,7 +18,7 @@ import lz4.frame
 import zstandard
 
 from studies.pages import ROOT
-from studies.torture.damage import ENDLESS_VIEW, MAGIC, Record, join_bag, join_mcap
+from studies.torture.damage import ENDLESS_VIEW, HUGE_ROWS, MAGIC, Record, join_bag, join_mcap
 from studies.torture.seeds import SEEDS, START_NS
 from studies.torture.workers import LIMIT_S, Verdict, judge_process, measured
 
@@ -64,10 +62,9 @@ def _mcap(*records: Record, behind: bytes = b"") -> bytes:
     return MAGIC + join_mcap([(b"\1", _text(b"ros2") + _text(b"torture")), *records]) + behind + join_mcap(end) + MAGIC
 
 
-def _file(name: str, content: Callable[[], bytes], folder: Path) -> Path:
-    path = folder / name
-    path.write_bytes(content())
-    return path
+def _placed(name: str, put: Callable[[Path], object], folder: Path) -> Path:
+    put(folder / name)
+    return folder / name
 
 
 def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: bytes, topic: bytes = b"/t") -> bytes:
@@ -75,22 +72,15 @@ def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: by
     return _mcap(*declared, *(_message(1, START_NS + i * 10**7, payload) for i in range(50)))
 
 
-def _zeros_zstd(size: int) -> bytes:
-    return _zeros(zstandard.ZstdCompressor(level=3).compressobj(size=size), size)
-
-
-def _zeros_lz4(size: int) -> bytes:
-    with lz4.frame.LZ4FrameCompressor() as compressor:
-        return bytes(compressor.begin()) + _zeros(compressor, size)
-
-
-def _zeros_bz2(size: int) -> bytes:
-    return _zeros(bz2.BZ2Compressor(9), size)
-
-
-def _zeros(compressor: Any, size: int) -> bytes:
-    block = bytes(1 << 20)
-    return b"".join([*(bytes(compressor.compress(block)) for _ in range(size >> 20)), bytes(compressor.flush())])
+def _zeros(kind: bytes, size: int) -> bytes:
+    compressors: dict[bytes, Callable[[], Any]] = {
+        b"zstd": lambda: zstandard.ZstdCompressor(level=3).compressobj(size=size),
+        b"lz4": lz4.frame.LZ4FrameCompressor,
+        b"bz2": lambda: bz2.BZ2Compressor(9),
+    }
+    compressor, block = compressors[kind](), bytes(1 << 20)
+    begin = compressor.begin() if kind == b"lz4" else b""
+    return b"".join([begin, *(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()])
 
 
 def _bag_chunk(compression: bytes, stored: bytes, size: int) -> bytes:
@@ -125,11 +115,9 @@ def _descriptors(levels: int, width: int) -> bytes:
     file = files.file.add(name="b.proto", package="p", syntax="proto3")
     for i in range(levels + 1):
         message = file.message_type.add(name=f"L{i}")
+        kind = {"type": 11, "type_name": f".p.L{i + 1}"} if i < levels else {"type": 1}
         for k in range(width):
-            if i < levels:
-                message.field.add(name=f"f{k}", number=k + 1, type=11, label=1, type_name=f".p.L{i + 1}")
-            else:
-                message.field.add(name=f"f{k}", number=k + 1, type=1, label=1)
+            message.field.add(name=f"f{k}", number=k + 1, label=1, **kind)
     return bytes(files.SerializeToString())
 
 
@@ -145,16 +133,6 @@ def _claimed_counts() -> bytes:
     return _mcap(_chunk(b"", inner, len(inner), zlib.crc32(inner)), index)
 
 
-def _fifo(folder: Path) -> Path:
-    os.mkfifo(folder / "drive.mcap")
-    return folder / "drive.mcap"
-
-
-def _device(folder: Path) -> Path:
-    (folder / "drive.mcap").symlink_to("/dev/zero")
-    return folder / "drive.mcap"
-
-
 def _loops(folder: Path) -> Path:
     """Two links to the folder that they lie in: 2^n ways lead to everything."""
     (folder / "a").symlink_to(".")
@@ -162,12 +140,9 @@ def _loops(folder: Path) -> Path:
     return folder
 
 
-def _sparse(folder: Path) -> Path:
-    path = folder / "drive.mcap"
-    with path.open("wb") as file:
-        file.write(_mcap()[:40])
-        file.truncate(20 << 30)
-    return path
+def _sparse(path: Path) -> None:
+    path.write_bytes(_mcap()[:40])
+    os.truncate(path, 20 << 30)
 
 
 def _metadata(text: str, folder: Path) -> Path:
@@ -192,11 +167,6 @@ def _database(statement: str, folder: Path) -> Path:
     return path
 
 
-_HUGE_ROW = (
-    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, "
-    "topic_id INTEGER, timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); "
-    "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM rows"
-)
 _FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
 _DECLARED = _schema(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT), _channel(1, b"/x", b"cdr")
 _ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
@@ -208,7 +178,7 @@ def _many_channels(n: int) -> bytes:
 
 
 def _made(name: str, codes: tuple[int, ...], content: Callable[[], bytes], suffix: str = ".mcap") -> Bomb:
-    return Bomb(name, partial(_file, f"drive{suffix}", content), codes)
+    return Bomb(name, partial(_placed, f"drive{suffix}", lambda path: path.write_bytes(content())), codes)
 
 
 GIB = 1 << 30
@@ -218,22 +188,22 @@ _MEMBERS = b"=" * 80 + b"\nMSG: "
 def _chunks() -> tuple[Bomb, ...]:
     """Return compressed chunks and files that unfold to gigabytes, or claim to."""
 
-    def mcap(name: str, compression: bytes, make: Callable[[int], bytes], size: int, claimed: int) -> Bomb:
-        return _made(name, _EITHER, lambda: _mcap(_chunk(compression, make(size), claimed)))
+    def mcap(name: str, kind: bytes, size: int, claimed: int) -> Bomb:
+        return _made(name, _EITHER, lambda: _mcap(_chunk(kind, _zeros(kind, size), claimed)))
 
-    def bag(name: str, compression: bytes, make: Callable[[int], bytes], size: int) -> Bomb:
-        return _made(name, _EITHER, lambda: _bag_chunk(compression, make(size), 1000), ".bag")
+    def bag(name: str, kind: bytes, size: int) -> Bomb:
+        return _made(name, _EITHER, lambda: _bag_chunk(kind, _zeros(kind, size), 1000), ".bag")
 
     return (
-        mcap("zstd chunk of 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 4 * GIB),
-        mcap("zstd chunk that claims 1000 bytes and contains 4 GiB", b"zstd", _zeros_zstd, 4 * GIB, 1000),
-        mcap("zstd chunk that claims 100 GB", b"zstd", _zeros_zstd, 1 << 20, 10**11),
-        mcap("lz4 chunk of 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 2 * GIB),
-        mcap("lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB, 1000),
-        bag("bag: bz2 chunk that claims 1000 bytes and contains 3 GiB", b"bz2", _zeros_bz2, 3 * GIB),
-        bag("bag: lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", _zeros_lz4, 2 * GIB),
-        _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros_zstd(8 * GIB), ".mcap.zst"),
-        _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros_zstd(4 * GIB), ".mcap.zstd"),
+        mcap("zstd chunk of 4 GiB", b"zstd", 4 * GIB, 4 * GIB),
+        mcap("zstd chunk that claims 1000 bytes and contains 4 GiB", b"zstd", 4 * GIB, 1000),
+        mcap("zstd chunk that claims 100 GB", b"zstd", 1 << 20, 10**11),
+        mcap("lz4 chunk of 2 GiB", b"lz4", 2 * GIB, 2 * GIB),
+        mcap("lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", 2 * GIB, 1000),
+        bag("bag: bz2 chunk that claims 1000 bytes and contains 3 GiB", b"bz2", 3 * GIB),
+        bag("bag: lz4 chunk that claims 1000 bytes and contains 2 GiB", b"lz4", 2 * GIB),
+        _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros(b"zstd", 8 * GIB), ".mcap.zst"),
+        _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros(b"zstd", 4 * GIB), ".mcap.zstd"),
     )
 
 
@@ -279,14 +249,14 @@ def _declarations() -> tuple[Bomb, ...]:
 BOMBS = (
     *_chunks(),
     *_declarations(),
-    Bomb("a FIFO", _fifo, _NO_LOG),
-    Bomb("a device", _device, _NO_LOG),
+    Bomb("a FIFO", partial(_placed, "drive.mcap", os.mkfifo), _NO_LOG),
+    Bomb("a device", partial(_placed, "drive.mcap", lambda path: path.symlink_to("/dev/zero")), _NO_LOG),
     Bomb("two links to their own folder", _loops, (1, 2)),
-    Bomb("20 GiB of nothing behind a header", _sparse, _EITHER),
+    Bomb("20 GiB of nothing behind a header", partial(_placed, "drive.mcap", _sparse), _EITHER),
     Bomb("metadata.yaml that unfolds to 10^11 names", partial(_metadata, _laughs()), (1, 2)),
     Bomb("metadata.yaml 3000 deep", partial(_metadata, "rosbag2_bagfile_information: " + "[" * 3000), (1, 2)),
     Bomb("database whose messages are an endless view", partial(_database, ENDLESS_VIEW), _EITHER),
-    Bomb("database whose rows are 900 MB of nothing each", partial(_database, _HUGE_ROW), _EITHER),
+    Bomb("database whose rows are 900 MB of nothing each", partial(_database, HUGE_ROWS), _EITHER),
 )
 
 

@@ -3,8 +3,6 @@
 Each case plants a fault, repeats the command as a user would, and compares every file with an undisturbed output.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -64,7 +62,7 @@ class Fleet:
     lasts_s: float
 
     @classmethod
-    def of(cls, logs: Path, calm: Path) -> Fleet:
+    def of(cls, logs: Path, calm: Path) -> "Fleet":
         """Run the logs undisturbed."""
         shutil.rmtree(calm, ignore_errors=True)
         ended = _run(logs, calm)

@@ -7,8 +7,6 @@ new is put behind the others, and a link to another block is directed to it. HDF
 own libraries. The same seed and number give the same file.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import random
@@ -36,29 +34,14 @@ EDGES = (
     0, 1, 2, 7, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**62, 2**63 - 1, 2**63,
     2**64 - 1,
 )  # fmt: skip
-#: Texts that turn into paths, markup, terminal codes, forged lines, recursion.
-TEXTS = (
-    b"", b"..", b"/", b"../../../etc/passwd", b"/wheels[/red]", b"[bold]x[/]", b"\x1b[2J\x1b[31mwarning",
-    b"a\nwarning: b", b"\0", b"\xff\xfe", b"\xed\xa0\x80", "\u202etxt.mcap".encode(), b"a" * 5000, b"$(id)",
-    b"</script>", b"%s%n", b"../../odd/msg/T", b"sensor_msgs/msg/Imu", b"nav_msgs/msg/Odometry", b"std_msgs/String",
-)  # fmt: skip
-SCHEMAS = (
-    b"float64[4294967296] x\n",
-    b"float64[99999999999999999999] x\n",
-    b"A[] a\n" + b"=" * 80 + b"\nMSG: p/A\nA[] a\n",
-    b"\n".join([b"A0 a"] + [b"=" * 80 + b"\nMSG: p/A%d\nA%d[2] a\nA%d[2] b" % (i, i + 1, i + 1) for i in range(40)]),
-    b'{"$ref": "#"}',
-    b'{"properties": {"a": {"$ref": "#"}, "b": {"$ref": "#"}}}',
-    b'{"a":' * 900 + b"1" + b"}" * 900,
-    b'{"type": "array", "items": [{}, {}]}',
-    b'{"type": ["number", "null"], "properties": 3}',
-    b"[" * 5000,
-    b"string<=5 a\nint32 A=3\n",
-    b"float64 x  # [/red]\nfloat64 x\n",
-    b"module a { module b { struct C { sequence<sequence<double>> x; }; }; };",
-    b"\x0a\xff\xff\xff\xff\x0f",
-    b"\x0a\x02\x0a\x00",
-)
+#: Hostile texts by their kind, documented in their file.
+_TEXTS = {
+    kind: tuple(re.sub(r"<<(.+?) \* (\d+)>>", lambda m: m[1] * int(m[2]), text).encode("latin-1") for text in texts)
+    for kind, texts in read_toml(Path(__file__).with_name("texts.toml")).items()
+}
+TEXTS, _FORMULAS, _CELLS = _TEXTS["texts"], _TEXTS["formulas"], _TEXTS["texts"] + _TEXTS["cells"]
+_DOUBLING = b"".join(b"\n%s\nMSG: p/A%d\nA%d[2] a\nA%d[2] b" % (b"=" * 80, i, i + 1, i + 1) for i in range(40))
+SCHEMAS = (*_TEXTS["schemas"][:3], b"A0 a" + _DOUBLING, *_TEXTS["schemas"][3:])
 
 
 # ------------------------------------------------------------------------------------------------ bytes
@@ -212,7 +195,7 @@ def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
     try:
         start, end, size, _, n = struct.unpack_from("<QQQII", payload)
         compression = payload[32 : 32 + n]
-        inner = _split_mcap(_unpacked(compression, payload[40 + n :], size))
+        inner = _split_mcap(_CODECS.get(compression, _PLAIN)[0](payload[40 + n :], size))
     except Exception:  # noqa: BLE001 (the decompressor raises any exception on an earlier fault)
         return op, damage_bytes(payload, rng)
     if inner:
@@ -221,7 +204,7 @@ def _damage_mcap_chunk(record: Record, rng: random.Random) -> Record | None:
     size, crc = len(body), zlib.crc32(body)
     if rng.random() < 0.1:
         compression = rng.choice((b"", b"lz4", b"zstd", b"xz", b"\xff"))
-    packed = _packed(compression, body)
+    packed = _CODECS.get(compression, _PLAIN)[1](body)
     if rng.random() < 0.15:
         size = rng.choice(EDGES)
     if rng.random() < 0.15:
@@ -256,37 +239,32 @@ def _damage_bag_chunk(record: Record, rng: random.Random) -> Record | None:
     if found is None:
         return None
     try:
-        inner = _split_bag(_unpacked(found[1], data, 0))
+        inner = _split_bag(_CODECS.get(found[1], _PLAIN)[0](data, 0))
     except Exception:  # noqa: BLE001 (as above)
         return header, damage_bytes(data, rng)
     if inner:
         _damage_list(inner, rng)
     body = join_bag(inner)
     size = struct.pack("<I", len(body) if rng.random() < 0.95 else rng.choice(EDGES) % 2**32)
-    return re.sub(rb"(?s)(?<=size=).{4}", lambda _: size, header), _packed(found[1], body)
+    return re.sub(rb"(?s)(?<=size=).{4}", lambda _: size, header), _CODECS.get(found[1], _PLAIN)[1](body)
 
 
-def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
-    if compression == b"zstd":
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    if compression == b"lz4":
-        return bytes(lz4.frame.decompress(stored))
-    return bz2.decompress(stored) if compression == b"bz2" else stored
-
-
-def _packed(compression: bytes, body: bytes) -> bytes:
-    if compression == b"zstd":
-        return zstandard.ZstdCompressor().compress(body)
-    if compression == b"lz4":
-        return bytes(lz4.frame.compress(body))
-    return bz2.compress(body) if compression == b"bz2" else body
+_CODECS: dict[bytes, tuple[Callable[[bytes, int], bytes], Callable[[bytes], bytes]]] = {
+    b"zstd": (
+        lambda stored, size: zstandard.ZstdDecompressor().decompress(stored, max_output_size=size),
+        lambda body: zstandard.ZstdCompressor().compress(body),
+    ),
+    b"lz4": (lambda stored, _: lz4.frame.decompress(stored), lz4.frame.compress),
+    b"bz2": (lambda stored, _: bz2.decompress(stored), bz2.compress),
+}
+_PLAIN = (lambda stored, _: stored, bytes)
 
 
 # ------------------------------------------------------------------------------------------------ databases
 
 #: Statements with a value and an identifier, and statements that change the structure.
 _SQL = read_toml(Path(__file__).with_name("statements.toml"))
-ENDLESS_VIEW: str = _SQL["structure"][-1]
+ENDLESS_VIEW, HUGE_ROWS = _SQL["structure"][-1], _SQL["huge_rows"]
 
 
 def damage_database(content: bytes, rng: random.Random) -> bytes:
@@ -309,24 +287,10 @@ def damage_database(content: bytes, rng: random.Random) -> bytes:
             except sqlite3.Error:
                 continue
         database.commit()
-        stored: bytes = database.serialize()
-        return stored
+        return bytes(database.serialize())
 
 
 # ------------------------------------------------------------------------------------------------ tables
-
-#: Writes this file where a reader evaluates it.
-CALL = b"__import__('os').system('echo x > formula_was_run')"
-_FORMULAS = (
-    CALL + b"+X*1.0", b"X1*(" + CALL + b")", b"9**9**9**9", b"(" * 5000 + b"X" + b")" * 5000, b"X/0", b"X[10**9]",
-    b"sin(X)+Y", b"X.__class__.__mro__[1].__subclasses__()", b"(lambda: X)()",
-    b"X if X else open('formula_was_run', 'w')",
-)  # fmt: skip
-_CELLS = (
-    *TEXTS, b"nan", b"-nan(ind)", b"1e999", b"-1e308", b"5e-324", b"0x4f", b"1,5", b'"', b'"a\nb', b"\xe2\x88\x921",
-    b"9" * 400, b"1_000", b"inf", b"=" + CALL, b"2024-05-01T12:00:00+99:99", b"24:60:61", b"-",
-    b"9223372036854775808", b"#", b";", b"\t",
-)  # fmt: skip
 
 
 def zeros(size: int) -> bytes:

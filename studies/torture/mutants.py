@@ -1,7 +1,5 @@
 """Mutants of recordings in supervised processes, and of every format in separate processes, with their verdicts."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct

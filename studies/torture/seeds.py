@@ -3,8 +3,6 @@
 They are written by :mod:`studies.strangers.containers`.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -16,6 +14,7 @@ import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
 from studies.mcap_logs import Message, messages, write_log
+from studies.pages import read_toml
 from studies.strangers.cars import Series
 from studies.strangers.containers import Topic, copied, write
 from studies.strangers.recordings import imu, message, steering, velocity
@@ -62,8 +61,8 @@ def _texts() -> Iterator[Message]:
         yield Message(stamp, stamp, "/note", data, "cdr", ("std_msgs/msg/String", "ros2msg", b"string data\n"))
 
 
-def _mcap(container: str, path: Path, **options: Any) -> None:
-    """Write a log with a metadata record and an attachment; ``options`` of ``mcap.writer.Writer``."""
+def _mcap(path: Path, container: str, compression: str = "ZSTD", index: str = "ALL", use_chunking: bool = True) -> None:
+    """Write a log with a metadata record and an attachment."""
 
     def notes(writer: Writer) -> None:
         writer.add_metadata("drive", {"driver": "nobody", "tyres": "summer"})
@@ -75,10 +74,12 @@ def _mcap(container: str, path: Path, **options: Any) -> None:
         topics, texts = (Topic("/vehicle/state", "car.State", _FEW_NS, _FEW_NS, state),), []
     with tempfile.TemporaryDirectory() as folder:
         written = sorted([*messages(write(topics, Path(folder) / "log", container)), *texts], key=lambda m: m[0])
-    write_log(path, written, "ros2" if texts else "", notes, chunk_size=_CHUNK_BYTES, **options)
+    options = {"compression": CompressionType[compression], "index_types": IndexType[index]}
+    profile = "ros2" if texts else ""
+    write_log(path, written, profile, notes, chunk_size=_CHUNK_BYTES, use_chunking=use_chunking, **options)
 
 
-def _bag(compression: str, path: Path) -> None:
+def _bag(path: Path, compression: str = "") -> None:
     from rosbags.rosbag1 import Writer
 
     writer = Writer(path)
@@ -94,19 +95,12 @@ def _database(path: Path) -> None:
         shutil.copyfile(database, path)
 
 
+#: Options of each seed, and suffix and layouts of each format, documented in their file.
+_TABLES = read_toml(Path(__file__).with_suffix(".toml"))
+_WRITERS: dict[str, Callable[..., None]] = {".mcap": _mcap, ".bag": _bag, ".db3": _database}
 #: Writer of each seed, by file name.
 SEEDS: dict[str, Callable[[Path], None]] = {
-    "zstd.mcap": partial(_mcap, "mcap"),
-    "lz4.mcap": partial(_mcap, "mcap", compression=CompressionType.LZ4),
-    "plain.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE),
-    "unchunked.mcap": partial(_mcap, "mcap", compression=CompressionType.NONE, use_chunking=False),
-    "noindex.mcap": partial(_mcap, "mcap", index_types=IndexType.NONE),
-    "json.mcap": partial(_mcap, "mcap-json"),
-    "protobuf.mcap": partial(_mcap, "mcap-protobuf"),
-    "plain.bag": partial(_bag, ""),
-    "bz2.bag": partial(_bag, "BZ2"),
-    "lz4.bag": partial(_bag, "LZ4"),
-    "rosbag2.db3": _database,
+    name: partial(_WRITERS[Path(name).suffix], **entry) for name, entry in _TABLES["seeds"].items()
 }
 
 
@@ -120,18 +114,10 @@ def write_seeds(folder: Path) -> dict[str, bytes]:
 
 
 RECORDINGS = ("mcap", "bag", "db3")
-#: Suffix and layouts of each format; a number after a version of MDF is its compression.
-FORMATS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "csv": ("csv", ("csv", "csv-german", "csv-gps", "csv-lab", "csv-dated", "csv-sources", "csv-pipes", "csv-long")),
-    "vbo": ("vbo", ("vbo",)),
-    "parquet": ("parquet", ("parquet", "parquet-nested", "parquet-long")),
-    "mat5": ("mat", ("mat", "mat-series", "mat-pairs", "mat-recorder")),
-    "mat73": ("mat", ("mat-7.3",)),
-    "mdf3": ("mdf", ("3.30 0",)),
-    "mdf4": ("mf4", ("mdf", "4.11 2", "can-mdf")),
-    "blf": ("blf", ("can-blf",)),
-    "asc": ("asc", ("can-asc",)),
-    **{suffix: (suffix, tuple(name for name in SEEDS if name.endswith(suffix))) for suffix in RECORDINGS},
+#: Suffix and layouts of each format; those of the recordings are seeds.
+FORMATS: dict[str, tuple[str, list[str]]] = {
+    **{name: (suffix, layouts) for name, (suffix, *layouts) in _TABLES["formats"].items()},
+    **{suffix: (suffix, [name for name in SEEDS if name.endswith(suffix)]) for suffix in RECORDINGS},
 }
 
 

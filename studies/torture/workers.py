@@ -1,7 +1,5 @@
 """Commands in this process or another one under limits; cases in supervised processes, killed if they hang or grow."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -201,10 +199,7 @@ def measured(*arguments: str, limit_s: float = 60.0, **options: object) -> Proce
             time.sleep(_SAMPLE_S)
         wall_s = time.monotonic() - begin
         left = _outlived(process.pid)
-        texts = []
-        for file in (out, err):
-            file.seek(0)
-            texts.append(file.read().decode("utf-8", errors="replace"))
+        texts = [os.pread(f.fileno(), os.fstat(f.fileno()).st_size, 0).decode(errors="replace") for f in (out, err)]
     return Process(process.returncode, texts[0], texts[1], wall_s, peak, late, left)
 
 

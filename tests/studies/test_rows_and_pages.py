@@ -14,7 +14,7 @@ import pytest
 from pdhef_logtool import Car, inspect_log
 from pdhef_logtool.records.tracks import make_track
 from studies import conditions, reference
-from studies.calibration import coverage_table
+from studies.calibration import coverages
 from studies.drawn_cars import fit_vehicle
 from studies.gates import __main__ as gates
 from studies.gates.rows import GateRow
@@ -23,7 +23,7 @@ from studies.peers import __main__ as study
 from studies.peers.drives import FULL_SIZE, PEER_DRIVES
 from studies.peers.page import estimator_table
 from studies.peers.scoring import errors, scores
-from studies.teaching import CARS, STORED, Pair, is_worse, pair_table, ratio, summary
+from studies.teaching import CARS, STORED, Pair, blocks, is_worse, ratio
 from truthsim.vehicle_choice import choose_vehicle
 
 
@@ -111,8 +111,8 @@ def pair(untaught: float, hybrid: float) -> Pair:
 def test_a_pair_is_worse_beyond_the_larger_of_both_limits():
     assert not is_worse(pair(0.2, 0.229)) and is_worse(pair(0.2, 0.231))
     assert not is_worse(pair(2.0, 2.09)) and is_worse(pair(2.0, 2.11))
-    text = summary([pair(1.0, 0.5), pair(1.0, 0.8)])
-    assert "0.63 (2 pairs)" in text and "worse" in pair_table([pair(0.2, 0.3)])
+    text = blocks([pair(1.0, 0.5), pair(1.0, 0.8)])["pairs_summary"]
+    assert "0.63 (2 pairs)" in text and "worse" in blocks([pair(0.2, 0.3)])["pairs"]
 
 
 def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught():
@@ -124,7 +124,7 @@ def test_the_stored_results_have_every_pair_and_none_is_worse_than_untaught():
     assert not any(is_worse(r) for r in stored)
     assert math.prod(map(ratio, stored)) <= 0.97 ** len(stored)
     page = (DOCS / "peers.md").read_text(encoding="utf-8")
-    assert pair_table(stored) in page and summary(stored) in page
+    assert all(blocks(stored)[name] in page for name in ("pairs", "pairs_summary"))
 
 
 def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(sample_logs_dir):
@@ -151,8 +151,8 @@ def test_a_calibrated_figure_is_accepted_and_others_are_not():
         for name, sd in {"right": 1.0, "narrow": 0.5, "wide": 3.0}.items()
         for e in errors
     ]
-    lines = [line.split("|") for line in coverage_table(pl.DataFrame(scores)).splitlines()[2:]]
-    assert {line[1].strip(): line[-2].strip() for line in lines} == {"right": "yes", "narrow": "no", "wide": "too wide"}
+    found = {row[0]: row[-1] for row in coverages(pl.DataFrame(scores))}
+    assert found == {"right": "yes", "narrow": "no", "wide": "too wide"}
 
 
 def test_names_of_cases_are_unique_and_all_are_stored_and_on_the_page():
