@@ -8,13 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from pdhef_logtool import RunConfig, inspect_log
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive import checks
 from pdhef_logtool.drive.check_table import TABLE, judge
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
-from pdhef_logtool.runs.inspection.report import inspect_log
 from tests.command_line import rendered
 
 NAME = "speed_m_s.range"

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool import Car, read_drive
 from pdhef_logtool.drive.sensor_changes import SensorChange, find_changes
 from pdhef_logtool.drive.truth_steps import steps_from_truth
 from pdhef_logtool.estimators.drive_signals import DriveSignals

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool import Car, read_drive
+from pdhef_logtool import Car, estimate, read_drive, score
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
@@ -16,7 +16,6 @@ from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import RATIO, REAR_STIFFNESS
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.frames import estimate, score
 
 NAMES = ("open-loop", "phy-ukf", "physics", "pd-hef")
 STEERING = ("steer_rad", "steering_wheel_rad")

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool import Car, RunConfig, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.latency_compensation import run_estimator
@@ -17,7 +16,6 @@ from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf
 from pdhef_logtool.evaluation.track_errors import signal_error
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.runs.config import RunConfig
 
 SAMPLES = Path(__file__).parents[2] / "sample_logs"
 #: Sideslip RMSE in degrees on sample logs with the shipped car: friction from the file, or from the user (sweep).

@@ -10,9 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.gnss_aided import GnssAided

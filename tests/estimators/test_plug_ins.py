@@ -13,7 +13,7 @@ import polars as pl
 import pytest
 from reference_car import drive, slalom, with_noise
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, RunConfig
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators import latency_compensation, table
 from pdhef_logtool.estimators.base import Steps, make_steps
@@ -25,7 +25,6 @@ from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model import interface
 from pdhef_logtool.residual_model.interface import ENTRY_POINTS, plug_in_names
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import called
 from tests.plug_in import install

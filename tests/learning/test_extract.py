@@ -11,7 +11,7 @@ import pytest
 from reference_car import Drive
 from residual_car import PULL_M_S2, weaving
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, Reporter, RunConfig
 from pdhef_logtool.car.model import CarModel
 from pdhef_logtool.car.toml_files import part_toml
 from pdhef_logtool.car.vehicle import default_vehicle
@@ -19,9 +19,7 @@ from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_datase
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
-from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.storage.documents import is_sealed, seal
 from pdhef_logtool.storage.outputs import OutputFolder
 from tests.run_report import follows

@@ -17,8 +17,7 @@ from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.definitions import message_definition, read_definitions
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter
-from pdhef_logtool.mapping import auto_map
-from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.mapping import auto_map, choose_mapping
 from pdhef_logtool.records.errors import MappingError, UsageError
 from studies.strangers.containers import Topic, shapes, write
 

@@ -8,20 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, estimate, load_mapping, read_drive
 from pdhef_logtool.car.model import CarModel, TaughtParameter, read_model
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import OFF, ReadOptions
 from pdhef_logtool.drive.plan import with_earlier_drive
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.estimators.vehicle_ukf import of_car
-from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.measured_noise import measured_noise
 from pdhef_logtool.records.errors import MappingError, VehicleError
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs.frames import estimate
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.sensors import SensorNoise
 

@@ -16,15 +16,14 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pdhef_logtool import Reporter, RunConfig
 from pdhef_logtool.evaluation.validation_plan import default_plan
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.fleet import summarise
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_run
 from pdhef_logtool.results.run_report import LogOutcome
 from pdhef_logtool.runs import fleet
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import Schedule, run_logs
 from pdhef_logtool.runs.working import DriveEnd, DriveTask, run_on_node
 from pdhef_logtool.workers.supervisor import Limits, Tell

@@ -9,11 +9,10 @@ import polars as pl
 import pytest
 
 import pdhef_logtool as pdhef
+from pdhef_logtool import RunConfig, open_run
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.reports.drive import drive_page
 from pdhef_logtool.reports.pdf import pdf_page
-from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.runs.run_result import RunResult

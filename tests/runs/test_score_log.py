@@ -11,9 +11,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pdhef_logtool import Reporter, RunConfig
 from pdhef_logtool.records.errors import MappingError, UsageError
-from pdhef_logtool.records.reporter import Reporter
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from tests.run_report import follows
