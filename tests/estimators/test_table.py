@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
-#: All rows except the estimator on a self-calibrated car (``tests/model/test_intervals.py``).
+#: All rows except the estimator on a self-calibrated car (``tests/model/test_car_fit.py``).
 LINES = tuple(s for s in table.all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
