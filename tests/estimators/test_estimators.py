@@ -285,8 +285,8 @@ def test_no_fault_breaks_an_estimator(fault, plain):
     faulty = FAULTS[fault](plain)
     cars = [(name, VEHICLE) for name in (*NAMES, *NETWORKS)]
     cars += [(name, STIFFNESS_VEHICLE) for name in FILTERS if "friction" in fault]
-    for name, vehicle in cars:
-        track = run_estimator(make_estimator(name, car_of(vehicle)), faulty)
+    for name, of_car in cars:
+        track = run_estimator(make_estimator(name, car_of(of_car)), faulty)
         assert len(track) == len(faulty)
         check_sane(track, name, faulty)
         assert len(faulty) < 2 or track.valid[-50:].all(), f"{name} must run again after the fault"

@@ -368,7 +368,7 @@ def spin(t: np.ndarray, at: float = 2.0, length: float = 2.5, size: float = 10.0
 
 
 @pytest.fixture(scope="module")
-def slipping():
+def rolling():
     made = rolling_drive(start_and_stop, lambda t: 0.004 * np.sin(t), 20.0)
     return replace(made, signals=with_noise(made.signals, 3))
 
@@ -377,39 +377,39 @@ def believed(signals: Signals, **options) -> np.ndarray:
     return believable(signals, SENSORS, None, **options)[0].speed_m_s
 
 
-def test_a_drive_without_slip_is_left_alone(slipping):
-    assert believable(slipping.signals, SENSORS, None)[0] is slipping.signals
+def test_a_drive_without_slip_is_left_alone(rolling):
+    assert believable(rolling.signals, SENSORS, None)[0] is rolling.signals
     made = drive(slalom(0.06, 0.7), 12.0, acceleration=lambda t: -6.0 if 4.0 < t < 6.0 else 0.0)
     noisy = with_noise(made.signals, 5)
     assert believable(noisy, SENSORS, None)[0] is noisy
 
 
 @pytest.mark.parametrize("size", [10.0, 20.0])
-def test_spinning_wheels_are_not_believed(slipping, size):
-    slipping = replace(slipping.signals, speed_m_s=slipping.signals.speed_m_s + spin(slipping.time_s, size=size))
+def test_spinning_wheels_are_not_believed(rolling, size):
+    slipping = replace(rolling.signals, speed_m_s=rolling.signals.speed_m_s + spin(rolling.time_s, size=size))
     out = believed(slipping)
-    error = np.abs(out - slipping.vx)
+    error = np.abs(out - rolling.vx)
     assert np.nanmax(error) < 2.0  # the bound plus the growth of the tolerance
-    lasts = (slipping.time_s > 2.8) & (slipping.time_s < 3.8)
+    lasts = (rolling.time_s > 2.8) & (rolling.time_s < 3.8)
     assert np.isnan(out[lasts & np.isfinite(slipping.speed_m_s)]).all()
-    away = (slipping.time_s < 2.0) | (slipping.time_s > 5.5)
+    away = (rolling.time_s < 2.0) | (rolling.time_s > 5.5)
     np.testing.assert_array_equal(out[away], slipping.speed_m_s[away])
     dead_reckoned = believed(slipping, reckoned=True)
     np.testing.assert_array_equal(np.isfinite(dead_reckoned), np.isfinite(slipping.speed_m_s))
-    assert np.nanmax(np.abs(dead_reckoned - slipping.vx)) < 2.0
+    assert np.nanmax(np.abs(dead_reckoned - rolling.vx)) < 2.0
 
 
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: e.name)
 @pytest.mark.slow
-def test_all_estimators_heed_it(slipping, estimator, monkeypatch):
-    slipping = replace(slipping.signals, speed_m_s=slipping.signals.speed_m_s + spin(slipping.time_s))
-    gated, undisturbed = (run_estimator(estimator, s) for s in (slipping, slipping.signals))
+def test_all_estimators_heed_it(rolling, estimator, monkeypatch):
+    slipping = replace(rolling.signals, speed_m_s=rolling.signals.speed_m_s + spin(rolling.time_s))
+    gated, undisturbed = (run_estimator(estimator, s) for s in (slipping, rolling.signals))
     for module in (stepwise, vehicle_ukf):
         monkeypatch.setattr(module, "believable", lambda signals, _sensors, memory, **_: (signals, memory))
-    plain, same = (run_estimator(estimator, s) for s in (slipping, slipping.signals))
+    plain, same = (run_estimator(estimator, s) for s in (slipping, rolling.signals))
 
     def worst(track):
-        return np.nanmax(np.abs(track.vx_m_s - slipping.vx)[slipping.time_s > 0.5])
+        return np.nanmax(np.abs(track.vx_m_s - rolling.vx)[rolling.time_s > 0.5])
 
     assert worst(gated) < 1.5
     assert worst(plain) > 5.0
@@ -434,7 +434,7 @@ def test_locked_wheels_are_not_believed_however_long_it_takes():
     assert np.abs(track.vx_m_s[-100:]).max() < 0.02
 
 
-def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(slipping):
+def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(rolling):
     """No pulses below 0.8 m/s, with a start of 5 m/s²: the speed jumps, and stops dead."""
     made = rolling_drive(
         lambda t: np.clip(np.minimum(5.0 * (t - 1.0), 5.0 * (8.0 - t)), 0.0, 10.0), np.zeros_like, 12.0
@@ -445,26 +445,26 @@ def test_a_standstill_and_the_floor_of_the_pulses_are_no_slip(slipping):
     assert believable(floor, SENSORS, None)[0] is floor
 
 
-def test_a_speed_that_lasts_is_believed_in_the_end(slipping):
-    jumped = replace(slipping.signals, speed_m_s=slipping.signals.speed_m_s + np.where(slipping.time_s > 4.0, 6.0, 0.0))
+def test_a_speed_that_lasts_is_believed_in_the_end(rolling):
+    jumped = replace(rolling.signals, speed_m_s=rolling.signals.speed_m_s + np.where(rolling.time_s > 4.0, 6.0, 0.0))
     out = believed(jumped)
-    assert np.isnan(out[(slipping.time_s > 5.0) & (slipping.time_s < 8.0) & np.isfinite(jumped.speed_m_s)]).all()
-    late = slipping.time_s > 4.0 + TIMEOUT_S + 0.5
+    assert np.isnan(out[(rolling.time_s > 5.0) & (rolling.time_s < 8.0) & np.isfinite(jumped.speed_m_s)]).all()
+    late = rolling.time_s > 4.0 + TIMEOUT_S + 0.5
     np.testing.assert_array_equal(out[late], jumped.speed_m_s[late])
 
 
-def test_without_an_accelerometer_nothing_is_gated(slipping):
-    blind = replace(slipping.signals, ax_m_s2=np.full(len(slipping.signals), np.nan))
-    blind = replace(blind, speed_m_s=blind.speed_m_s + spin(slipping.time_s))
+def test_without_an_accelerometer_nothing_is_gated(rolling):
+    blind = replace(rolling.signals, ax_m_s2=np.full(len(rolling.signals), np.nan))
+    blind = replace(blind, speed_m_s=blind.speed_m_s + spin(rolling.time_s))
     assert believable(blind, SENSORS, None)[0] is blind
 
 
 @pytest.mark.parametrize("estimator", FILTERS, ids=lambda e: e.name)
 @pytest.mark.slow
-def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimator, slipping):
+def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimator, rolling):
     """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""
-    silent = slipping.time_s > 9.0
-    signals = without_impossible(slipping.signals)
+    silent = rolling.time_s > 9.0
+    signals = without_impossible(rolling.signals)
     speed, ax = np.where(silent, np.nan, signals.speed_m_s), np.where(silent, -4.0, signals.ax_m_s2)
     signals = replace(signals, speed_m_s=speed, ax_m_s2=ax)
     steps, _ = estimator.run(signals, None)
@@ -473,10 +473,10 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(estimato
     assert (steps.inputs[back & silent, U_SPEED] > 0.5).all()
     track = run_estimator(estimator, signals)
     assert not track.valid[back & silent].any()
-    assert track.valid[~back & (slipping.time_s > 0.5)].all()
+    assert track.valid[~back & (rolling.time_s > 0.5)].all()
 
 
 @pytest.mark.parametrize("slope", [-2.0, 2.0])
-def test_a_steep_hill_is_no_slip(slipping, slope):
-    hill = replace(slipping.signals, ax_m_s2=slipping.signals.ax_m_s2 + slope)
+def test_a_steep_hill_is_no_slip(rolling, slope):
+    hill = replace(rolling.signals, ax_m_s2=rolling.signals.ax_m_s2 + slope)
     assert believable(hill, SENSORS, None)[0] is hill
