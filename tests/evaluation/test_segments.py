@@ -234,7 +234,7 @@ def test_a_gap_is_no_driving():
     assert sum(c["seconds"] for c in operating_space(late, None, None, VEHICLE)["cells"]) == pytest.approx(4.2, abs=0.1)
 
 
-# ---- Manoeuvres: every one of the simulator is found, on both sides, at any rate and time; ordinary roads have few ----
+# ---- manoeuvres: each of the simulator is found, on both sides, at any rate and time; ordinary roads have few ----
 
 #: Recognised manoeuvre of each manoeuvre of the simulator.
 EXPECTED_MANOEUVRES = {

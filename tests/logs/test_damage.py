@@ -261,7 +261,7 @@ def test_damage_of_a_summary_is_a_note(tmp_path):
     assert called("inspect", path).returncode == EXIT_OK
 
 
-# ---- Hostile and corrupt files: declared sizes beyond memory, files of another format, files that shrink while open ----
+# ---- hostile and corrupt files: declared sizes beyond memory, other formats, files that shrink while open ----
 
 EACH = 300
 _MAGIC = b"\x89MCAP0\r\n"

@@ -252,7 +252,7 @@ def test_the_vehicles_of_the_band_spread_as_the_posterior_does():
     assert 0.7 * by[REAR_STIFFNESS].sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * by[REAR_STIFFNESS].sd
 
 
-# ---- Confidence intervals: own standard deviation, uncertainty of the parameters, and contradictions of the sensors ----
+# ---- intervals: own standard deviation, uncertainty of the parameters, contradictions of the sensors ----
 
 OWN = default_vehicle().model_copy(update={"name": "mine"})
 BIASES = {"sensors": OWN.sensors.model_copy(update={"ay_bias_m_s2": 0.1, "yaw_rate_bias_rad_s": 0.001})}
