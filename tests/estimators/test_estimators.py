@@ -406,7 +406,7 @@ def on_time(signals: Signals) -> Signals:
 
 @pytest.fixture(scope="module")
 def jumping():
-    """A jumping drive with a gap that restarts the filter and a gyro that jumps."""
+    """A rough drive with a gap that restarts the filter and a gyro that jumps."""
     s = rough_drive(12, 700, 6)
     t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
     s.yaw_rate_rad_s[(t > 5.0) & (t < 5.6)] += 0.5
