@@ -11,13 +11,11 @@ import polars as pl
 import pytest
 from mcap.writer import CompressionType
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, ReadOptions, inspect_log
 from pdhef_logtool.cli.app import app
-from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
 from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.runs.inspection.report import inspect_log
 from studies.mcap_logs import Message, messages, stamp_ns, stamped, write_log
 
 S = 1_000_000_000

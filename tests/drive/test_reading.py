@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, ReadOptions, RunConfig
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive import reading, recorded
 from pdhef_logtool.drive.friction import FrictionFrom, friction_source, parse_friction
-from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, Tell, friction_of, one_log, read_drive
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.logs.discovery import hash_log
@@ -20,7 +19,6 @@ from pdhef_logtool.mapping import Mapping, SignalSource, read_signals
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.runs.config import RunConfig
 from studies.strangers.containers import Topic, write
 
 

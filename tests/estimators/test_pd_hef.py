@@ -1,31 +1,46 @@
 """pd-hef is ``physics`` plus exactly the residual, of a network or a taught car; a right residual makes it right."""
 
+import json
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
-from made_models import linear_residual, random_network
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_models import full_network, linear_residual, random_network
 from physics_oracle import G, Oracle, parts, vehicle
-from reference_car import FRICTION, Drive, drive, slalom, with_noise
+from reference_car import FRICTION, Drive, drive, make_signals, slalom, with_noise
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, RunConfig
 from pdhef_logtool.car.model import CarModel
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, physics_sha256
+from pdhef_logtool.car.parts import Algorithm, FilterNoise, FittedPhysics, physics_sha256
 from pdhef_logtool.car.posterior import Posterior
-from pdhef_logtool.car.vehicle import PhysicsParts, Tyres, correct_signals, default_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, PhysicsParts, Tyres, correct_signals, default_vehicle
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.sensor_faults import without_faults
+from pdhef_logtool.estimators import table
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Smoother
+from pdhef_logtool.estimators.divergence import watched_track
 from pdhef_logtool.estimators.drive_signals import calibrated_signals
 from pdhef_logtool.estimators.latency_compensation import run_estimator
+from pdhef_logtool.estimators.presets import OPEN_LOOP
 from pdhef_logtool.estimators.residual_response import residual_response
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.estimators.vehicle_ukf import VehicleUkf, physics_filter
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.ladder import LadderModel
+from pdhef_logtool.results.run_report import lines_of
+from pdhef_logtool.runs.fleet import run_logs
+from tests.command_line import rendered
+from truthsim.drive import simulate_drive, write_drive
 
 pytestmark = pytest.mark.slow
 
@@ -317,8 +332,8 @@ def test_its_response_is_the_one_that_teaching_uses(driven):
     response = residual_response(estimator, driven, np.arange(len(driven)))
     rate = 0.2 * np.sin(np.arange(len(driven)) / 30.0)
     tracks = []
-    for given in (0.0, 1.0):
-        rates = np.stack([given * rate, np.zeros(len(rate))], axis=1)
+    for share in (0.0, 1.0):
+        rates = np.stack([share * rate, np.zeros(len(rate))], axis=1)
         steps, _ = estimator.physics.run(driven, None, rates)
         tracks.append(np.arctan2(steps.x[:, 1], steps.x[:, 0]))
     expected = tracks[1] - tracks[0]
@@ -353,3 +368,283 @@ def test_a_car_without_a_residual_or_with_a_named_gain_does_not_take_it():
     assert make_estimator("pd-hef", taught_car(linear_residual())).causal
     with_network = replace(taught_car(linear_residual()), network=random_network())
     assert not acts(make_estimator("pd-hef:gain=1", with_network)) and acts(make_estimator("pd-hef", with_network))
+
+
+# ---- The table of estimators: every row builds its estimator, and the identity follows from the estimator object ----
+
+NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
+#: All rows except the estimator on a self-calibrated car (``tests/model/test_car_fit.py``).
+LINES = tuple(s for s in table.all_specs() if s.name != OPEN_LOOP)
+every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
+
+
+MODEL = full_network()
+#: It has all that any estimator needs.
+CAR = Car(SEDAN, network=MODEL, noise={"phy-ukf:tuned": NOISE, "physics": NOISE}, network_gain=1.0)
+
+
+@pytest.fixture(scope="module")
+def slalom_signals():
+    s = with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85), ready_ns=s.stamps_ns + 10_000_000)
+
+
+def run(name: str, signals: Signals, car: Car = CAR) -> StateTrack:
+    return run_estimator(table.make_estimator(name, car), signals)
+
+
+def same_track(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
+    columns = [f.name for f in fields(StateTrack) if isinstance(getattr(a, f.name), np.ndarray)]
+    return all(np.array_equal(getattr(a, c)[:upto], getattr(b, c)[:upto], equal_nan=True) for c in columns)
+
+
+# --- the lines -------------------------------------------------------------------------------------------------------
+
+
+def test_no_two_lines_share_a_name_or_a_colour():
+    for attribute in ("name", "colour", "text"):
+        assert len({getattr(s, attribute) for s in table.SPECS}) == len(table.SPECS)
+    assert all(0 < s.colour <= 0xFFFFFF for s in table.SPECS)
+
+
+@every_spec
+def test_a_line_builds_what_it_says(spec):
+    estimator = table.make_estimator(spec.name, CAR)
+    assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
+    assert isinstance(estimator, Smoother) == (not spec.causal)
+    assert table.spec_of(spec.name) is spec
+    assert (spec.name in table.all_names(CAR)) == (spec.group == table.ALL_ESTIMATORS)
+    assert spec.needs <= frozenset(ALIGNED_SIGNALS)
+
+
+@every_spec
+def test_what_it_needs_is_what_it_needs(spec, slalom_signals):
+    """An estimator runs with only its required signals, is skipped if one is missing, and uses every one of them."""
+    dt = np.diff(slalom_signals.stamps_ns) * 1e-9
+    given = spec.needs | frozenset(sorted(spec.one_of)[-1:])  # with the yaw rate, where any lateral signal will do
+    bare = make_signals(dt, **{c: getattr(slalom_signals, c) for c in given})
+    estimators, skipped = table.runnable((spec.name,), CAR, bare.available)
+    assert ([e.name for e in estimators], skipped) == ([spec.name], [])
+    track = run(spec.name, bare)
+    assert track.valid[50:].all()
+    assert np.isfinite(track.vx_m_s[50:]).all()
+    assert np.isfinite(track.yaw_rate_rad_s[50:]).all()
+    for lacking in spec.needs:
+        estimators, skipped = table.runnable((spec.name,), CAR, frozenset(ALIGNED_SIGNALS) - {lacking})
+        assert estimators == []
+        assert [s.reason for s in skipped] == [f"the log has no {lacking}"]
+        without = replace(bare, **{lacking: np.full(len(bare), np.nan)})
+        assert not same_track(run(spec.name, without), track), lacking
+
+
+@every_spec
+def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec):
+    everything = frozenset(ALIGNED_SIGNALS)
+    estimators, skipped = table.runnable((spec.name,), Car(SEDAN), everything)
+    lacks = spec.network not in ("", "optional") or spec.needs_noise
+    wanted = ([], [spec.name]) if lacks else ([spec.name], [])
+    assert ([e.name for e in estimators], [s.name for s in skipped]) == wanted
+    if lacks:
+        assert "--network" in skipped[0].reason or "fit.toml" in skipped[0].reason
+        with pytest.raises(UsageError, match=spec.name):
+            table.make_estimator(spec.name, Car(SEDAN))
+    assert (spec.name in table.all_names(Car(SEDAN))) == (spec.group == table.ALL_ESTIMATORS and not lacks)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("physics-plus", r"expected estimators out of all, peers, zero, .* \(0 to 1\), got physics-plus$"),
+        *((f"pd-hef:{option}", f"got pd-hef:{option}$") for option in ("trust=1", "gain", "gain=2", "gain=nan", "")),
+        ("pd-hef:fixed-r=1", "got pd-hef:fixed-r=1$"),
+        ("physics:tuned", "got physics:tuned$"),
+        ("zero", "zero"),
+    ],
+)
+def test_an_unknown_name_or_option_is_answered_with_those_that_exist(name, message):
+    with pytest.raises(UsageError, match=message):
+        table.check_names(("zero", name))
+
+
+def test_a_group_names_its_estimators_and_each_runs_once():
+    everything = frozenset(ALIGNED_SIGNALS)
+    peers = [s.name for s in table.SPECS if s.group == table.PEERS]
+    assert [e.name for e in table.runnable((table.PEERS,), CAR, everything)[0]] == peers
+    table.check_names(("linear-kf", "physics", table.PEERS))
+    named, _ = table.runnable(("linear-kf", "physics", table.PEERS), CAR, everything)
+    assert [e.name for e in named] == ["linear-kf", "physics", *(n for n in peers if n != "linear-kf")]
+    both, _ = table.runnable((table.ALL_ESTIMATORS, table.PEERS), CAR, everything)
+    assert [e.name for e in both] == [*table.all_names(CAR), *peers]
+
+
+def test_a_name_states_the_gain():
+    assert ran("pd-hef:gain=0.5").options["trust"] == 0.5
+    assert table.make_estimator("pd-hef:gain=0.5", CAR).name == "pd-hef:gain=0.5"
+    _, skipped = table.runnable(("pd-hef:gain=0.5",), Car(SEDAN), frozenset(ALIGNED_SIGNALS))
+    assert [s.name for s in skipped] == ["pd-hef:gain=0.5"]
+
+
+# --- algorithm of each name ------------------------------------------------------------------------------------------
+
+
+def ran(name: str, car: Car = CAR, **options: Any) -> Algorithm:
+    return resolve(table.make_estimator(name, car, table.Options(**options)))
+
+
+# --- pd-hef without residual is physics ------------------------------------------------------------------------------
+
+BARE = replace(CAR, network_gain=None, noise={})
+
+
+def test_the_gain_decides_what_pd_hef_is():
+    trusted, cautious = table.make_estimator("pd-hef", CAR), table.make_estimator("pd-hef", BARE)
+    assert trusted.name == cautious.name == "pd-hef"
+    assert resolve(trusted).identity != resolve(cautious).identity
+    assert resolve(cautious) == ran("physics", BARE)
+    without = replace(CAR, network=None)
+    assert ran("pd-hef", without) == ran("physics", without)
+    papers = replace(CAR, network=MODEL.paper_network)
+    assert ran("pd-hef", papers) == ran("physics", papers)
+
+
+# ---- monitor of divergence: exact kinematics with and without an error of the estimate, and the wrong branch ----
+
+IMU_X_M, IMU_Y_M = 0.8, -0.3
+MEASURED_CAR = default_vehicle().model_copy(update={"imu_position_m": (IMU_X_M, IMU_Y_M, 0.0)})
+TILT = 1.0 + GRAVITY_M_S2 * MEASURED_CAR.roll_gradient_rad_per_m_s2
+SPEED_M_S = 25.0
+
+
+def motion(
+    share: float = 0.9, duration_s: float = 12.0, hz: float = 0.4, seed: int = 0, delay_ns: int = 10_000_000
+) -> tuple[Signals, StateTrack]:
+    """Return sensor signals and true state of a slalom up to a share of the grip, at irregular 100 Hz."""
+    rng = np.random.default_rng(seed)
+    dt = rng.uniform(0.008, 0.012, round(duration_s * 100))
+    t = np.concatenate([[0.0], np.cumsum(np.round(dt * 1e9) * 1e-9)])
+    w = 2.0 * math.pi * hz
+    peak = share * FRICTION * GRAVITY_M_S2 / SPEED_M_S
+    r, r_dot, r_dot2 = peak * np.sin(w * t), peak * w * np.cos(w * t), -peak * w * w * np.sin(w * t)
+    vy, vy_dot = -0.8 * r_dot, -0.8 * r_dot2
+    ay = vy_dot + SPEED_M_S * r
+    speed, friction = np.full(len(t), SPEED_M_S), np.full(len(t), FRICTION)
+    felt = TILT * ay + IMU_X_M * r_dot - IMU_Y_M * r * r
+    signals = make_signals(dt, delay_ns, ay_m_s2=felt, yaw_rate_rad_s=r, speed_m_s=speed, friction=friction)
+    covariance = np.tile(np.diag([0.01, 0.01, 1e-5]), (len(t), 1, 1))
+    state = {"vx_m_s": speed, "vy_m_s": vy, "yaw_rate_rad_s": r, "covariance": covariance}
+    track = make_track("f", signals.stamps_ns, **state)
+    return signals, track
+
+
+def off_by(track: StateTrack, degrees: float, from_s: float, to_s: float, rise_s: float = 0.3) -> StateTrack:
+    """Return the track with its sideslip off by an angle between two times, up and down within ``rise_s``."""
+    t = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
+    shape = np.clip((t - from_s) / rise_s, 0.0, 1.0) - np.clip((t - to_s) / rise_s, 0.0, 1.0)
+    return replace(track, vy_m_s=track.vy_m_s + SPEED_M_S * math.tan(math.radians(degrees)) * shape)
+
+
+def seconds(signals: Signals) -> np.ndarray:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def flags(track: StateTrack, signals: Signals) -> np.ndarray:
+    return watched_track(track, signals, MEASURED_CAR).diverged
+
+
+@settings(deadline=None, max_examples=20)
+@given(share=st.floats(0.0, 1.0), hz=st.floats(0.1, 1.5), seed=st.integers(0, 99))
+def test_the_true_motion_is_never_flagged(share, hz, seed):
+    signals, truth = motion(share, hz=hz, seed=seed)
+    rng, stds = np.random.default_rng(seed), (MEASURED_CAR.sensors.ay_std_m_s2, MEASURED_CAR.sensors.yaw_rate_std_rad_s)
+    ay, rate = (rng.normal(0.0, std, len(signals)) for std in stds)
+    noisy = replace(signals, ay_m_s2=signals.ay_m_s2 + ay, yaw_rate_rad_s=signals.yaw_rate_rad_s + rate)
+    assert not flags(truth, noisy).any()
+
+
+@settings(deadline=None, max_examples=20)
+@given(degrees=st.floats(8.0, 40.0), rise_s=st.floats(0.02, 1.0), sign=st.sampled_from([-1, 1]))
+def test_an_error_is_flagged_while_it_grows_and_taken_back_with_it(degrees, rise_s, sign):
+    signals, truth = motion()
+    found, t = flags(off_by(truth, sign * degrees, 5.0, 7.0, rise_s), signals), seconds(signals)
+    assert not found[t < 5.0].any()
+    grown = 5.0 + rise_s
+    assert found[(t > grown + 0.1) & (t < grown + 0.5)].all()
+    # The leaky integrator forgets up to 1 − e^(−2/3) of the error. This part changes sign when the error ends.
+    left = degrees * (1.0 - math.exp(-(2.0 + rise_s) / 3.0))
+    assert left > 2.9 or not found[t > 7.0 + rise_s + 0.1].any()
+
+
+def test_in_the_linear_range_bank_and_bias_are_no_divergence():
+    signals, truth = motion(share=0.3)
+    banked = replace(signals, ay_m_s2=signals.ay_m_s2 + 1.0)  # 10 % of bank
+    assert not flags(truth, banked).any()
+
+
+def test_bank_and_gain_near_the_limit_are_no_divergence():
+    signals, truth = motion(duration_s=25.0, hz=0.02)
+    banked = replace(signals, ay_m_s2=1.07 * signals.ay_m_s2 + GRAVITY_M_S2 * 0.04)
+    assert not flags(truth, banked).any()
+
+
+def test_noise_that_the_drive_shows_is_no_divergence():
+    signals, truth = motion()
+    noisy = replace(signals, ay_m_s2=signals.ay_m_s2 + np.random.default_rng(0).normal(0.0, 40.0, len(signals)))
+    shown = FilterNoise(r_std={"ay_m_s2": 40.0})
+    assert flags(truth, noisy).any() and not watched_track(truth, noisy, MEASURED_CAR, shown).diverged.any()
+    assert watched_track(off_by(truth, 40.0, 5.0, 7.0), noisy, MEASURED_CAR, shown).diverged.any()
+
+
+def test_what_comes_later_changes_no_flag():
+    signals, truth = motion()
+    wrong = off_by(truth, 20.0, 5.0, 7.0)
+    whole = flags(wrong, signals)
+    end = 600
+    part = flags(wrong.rows(0, end), signals.rows(0, end))
+    assert whole[:end].any()
+    np.testing.assert_array_equal(part, whole[:end])
+
+
+def test_the_watch_adds_to_what_an_estimator_says_itself_and_leaves_those_without_a_covariance():
+    signals, truth = motion()
+    own = np.zeros(len(signals), dtype=np.bool_)
+    own[:10] = True
+    wrong = off_by(truth, 20.0, 5.0, 7.0)
+    np.testing.assert_array_equal(flags(replace(wrong, diverged=own), signals), own | flags(wrong, signals))
+    plain = replace(wrong, covariance=np.empty((0, 3, 3)))
+    assert watched_track(plain, signals, MEASURED_CAR) is plain
+
+
+def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(sample_logs_dir, tmp_path):
+    """A growing sine on a slippery road: beyond the peak of the tyres, the true sideslip still moderate."""
+    drive = simulate_drive(
+        "sine-sweep", speed_km_h=100.0, friction=0.3, amplitude=1.08, seed=7302, keep_spins=True, tolerance=0.01
+    )
+    write_drive(drive, sweep := tmp_path / "sweep.mcap")
+    names = ("phy-ukf", "physics", "zero")
+    config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, keep="estimates")
+    result = run_logs([str(sweep)], tmp_path, config, report=False)
+    folder = tmp_path / "logs" / "sweep"
+    table = pl.read_parquet(folder / "estimates.parquet")
+    true = table.filter(pl.col("estimator") == "truth").select("stamp_ns", true="sideslip_rad")
+    report = json.loads((folder / "report.json").read_text())
+    text = rendered(render_run, result, 160)
+    for name in names[:2]:
+        of = table.filter(pl.col("estimator") == name).join(true, on="stamp_ns").sort("stamp_ns")
+        beta, truth = np.degrees(of["sideslip_rad"].to_numpy()), np.degrees(of["true"].to_numpy())
+        t = (of["stamp_ns"].to_numpy() - of["stamp_ns"][0]) * 1e-9
+        wrong = abs(beta - truth) > 8.0
+        start = float(t[int(np.flatnonzero(wrong)[0])])
+        # It is the wrong branch: within two seconds the estimate is far beyond the truth.
+        soon = (t >= start) & (t <= start + 2.0)
+        assert (abs(beta)[soon] > 2.5 * abs(truth)[soon]).any()
+        assert abs(beta)[soon].max() > 25.0
+        said = of["diverged"].to_numpy()
+        assert not said[t < start - 1.0].any()
+        first = float(t[int(np.flatnonzero(said)[0])])
+        assert first < start + 0.1
+        assert said[wrong].mean() > 0.7
+        spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
+        assert (spans[0]["start_ns"] - int(of["stamp_ns"][0])) * 1e-9 == pytest.approx(first, abs=1e-6)
+        (line,) = lines_of("diverged", report, name)
+        assert line.startswith("diverged for ") and line in text
+    assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()

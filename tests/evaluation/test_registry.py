@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 from mcap.reader import make_reader
 
+from pdhef_logtool import RunConfig, open_run
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.evaluation import metrics
 from pdhef_logtool.evaluation.metrics import metric as registry
@@ -17,8 +18,6 @@ from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.comparison import comparison_page
 from pdhef_logtool.results import comparing
 from pdhef_logtool.results.comparing import compare_runs, figure
-from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import printed, rendered
 

@@ -10,25 +10,21 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, ExtractSettings, ReadOptions, RunConfig, extract, read_drive
 from pdhef_logtool.car.model import ESTIMATED, read_model
 from pdhef_logtool.car.names import MODEL_FILE
 from pdhef_logtool.car.parts import Fit, LearntOn
 from pdhef_logtool.car.toml_files import part_toml
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning import learn as learning
 from pdhef_logtool.learning.drives import DriveRecord, LearnSettings, exit_code, tell_drive
 from pdhef_logtool.learning.learn import OpenedDrive, learn, learn_from, open_drive
-from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.truth import weight_of
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.fit import fit_car
 from pdhef_logtool.model.priors import REAR_STIFFNESS, TYRES, prior_of
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.config import RunConfig
 from tests.command_line import printed
 from tests.runs.test_inspection_report import write_log
 

@@ -14,8 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool import inspect_log
-from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool import ReadOptions, inspect_log, load_mapping
 from pdhef_logtool.logs.can_decoding import Decoder, Frames
 from pdhef_logtool.logs.can_logs import open_asc, open_blf, open_candump
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -23,8 +22,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, Tables
-from pdhef_logtool.mapping.channels import read_signals
-from pdhef_logtool.mapping.mapping_file import load_mapping
+from pdhef_logtool.mapping import read_signals
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 

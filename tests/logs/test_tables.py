@@ -20,8 +20,7 @@ from pdhef_logtool.logs.resource_limits import DEFAULT_LIMITS, LimitError
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
 from pdhef_logtool.logs.table_file import TableFile, TableSettings
 from pdhef_logtool.logs.text_logs import open_json_lines
-from pdhef_logtool.mapping.choosing import tables_for
-from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
+from pdhef_logtool.mapping import load_mapping, mapping_to_toml, tables_for
 from pdhef_logtool.records.errors import LogError, MappingFileError, PdhefError
 from tests.command_line import called
 from tests.table_contents import opened

@@ -10,12 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from pdhef_logtool import PdhefError, inspect_log
 from pdhef_logtool.cli import console
 from pdhef_logtool.cli.inspecting import render_inspection
-from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.printable import all_printable, listed, printable, utf8
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.runs.inspection.report import inspect_log
 from pdhef_logtool.storage.documents import jsonable
 from tests.command_line import printed
 

@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 
+from pdhef_logtool import RunConfig, open_run
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.reports.page import DASH, degrees, duration, number
 from pdhef_logtool.reports.pages import write_pages
-from pdhef_logtool.results.opened_run import open_run
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.reports.made_runs import drive_tracks, write_run
 from tests.reports.test_fleet_page import run_of

@@ -12,10 +12,8 @@ from fake_drive_log import FakeLog, FakeTopic
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.cli.inspecting import render_inspection
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.byte_source import LocalFile
 from pdhef_logtool.logs.mcap_index import read_index
 from pdhef_logtool.logs.remote_place import RemotePlace

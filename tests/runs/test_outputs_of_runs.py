@@ -10,11 +10,10 @@ from typing import Any
 import polars as pl
 import pytest
 
+from pdhef_logtool import RunConfig, open_run
 from pdhef_logtool.logs import byte_source
 from pdhef_logtool.records.errors import OutputError, UsageError
-from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs import working
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.drive_outputs import LOG_FILES
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.journal import Journal

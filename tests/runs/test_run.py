@@ -11,11 +11,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, ReadOptions, RunConfig, read_drive
 from pdhef_logtool.car.toml_files import part_toml, read_vehicle_file
 from pdhef_logtool.cli.run_tables import render_run
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.table import all_names
 from pdhef_logtool.model import fit
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
@@ -24,7 +22,6 @@ from pdhef_logtool.records.reasons import STUCK_AY
 from pdhef_logtool.results.parquet_sink import list_estimators, read_track
 from pdhef_logtool.results.run_report import report_markdown
 from pdhef_logtool.runs import selection
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from tests.command_line import rendered
 from tests.run_report import follows

@@ -5,14 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool import Car, RunConfig
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results.selected_estimate import MainFacts
 from pdhef_logtool.runs import selection
-from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.referencing import audit_truth
 from pdhef_logtool.runs.selection import choose_main, default_names

@@ -46,20 +46,14 @@ def exchange(request, monkeypatch):
 # ------------------------------------------------------------------------------------------------ transactions
 
 
-def test_a_new_folder_appears_whole(tmp_path):
-    with FolderTransaction(tmp_path / "out" / "x") as change:
-        write_bytes(change.file("a.txt"), b"a")
-        assert not (tmp_path / "out" / "x").exists()
-    assert texts(tmp_path) == {"out/x/a.txt": "a"}
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["x"]
-
-
-def test_an_old_folder_is_replaced_at_once(tmp_path, exchange):
-    make(tmp_path / "x", OLD)
-    with FolderTransaction(tmp_path / "x", keep=False) as change:
+@pytest.mark.parametrize("old", [{}, OLD], ids=["new", "replaced"])
+def test_a_folder_appears_or_is_replaced_at_once(tmp_path, exchange, old):
+    make(tmp_path / "out" / "x", old)
+    with FolderTransaction(tmp_path / "out" / "x", keep=False) as change:
         write_bytes(change.file("a.txt"), b"new a")
-        assert texts(tmp_path / "x") == OLD
-    assert texts(tmp_path) == {"x/a.txt": "new a"}
+        assert texts(tmp_path / "out" / "x") == old
+    assert texts(tmp_path) == {"out/x/a.txt": "new a"}
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["x"]
 
 
 def test_what_the_new_folder_has_not_is_kept_with_its_identity(tmp_path, exchange):
@@ -280,14 +274,6 @@ DONE = {"out.bin": b"new"}
 
 def folder(path: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in path.iterdir()}
-
-
-def test_what_was_there_stays_until_the_new_file_is_complete(tmp_path):
-    (tmp_path / "out.bin").write_bytes(b"old")
-    with PendingFile(tmp_path / "out.bin") as pending:
-        pending.path.write_bytes(b"new")
-        assert (tmp_path / "out.bin").read_bytes() == b"old"
-    assert folder(tmp_path) == DONE
 
 
 def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path):

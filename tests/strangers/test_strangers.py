@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool import inspect_log
-from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool import ReadOptions, inspect_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, read_signals
 from pdhef_logtool.mapping.can_frames import decoded_frames
