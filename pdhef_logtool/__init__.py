@@ -8,12 +8,10 @@ from pdhef_logtool.records.version import __version__
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car as Car
     from pdhef_logtool.drive.options import ReadOptions as ReadOptions
-    from pdhef_logtool.drive.reading import Drive as Drive
-    from pdhef_logtool.drive.reading import read_drive as read_drive
+    from pdhef_logtool.drive.reading import Drive as Drive, read_drive as read_drive
     from pdhef_logtool.learning.drives import LearnSettings as LearnSettings
     from pdhef_logtool.learning.learn import learn as learn
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
-    from pdhef_logtool.learning.network.extract_command import extract as extract
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings, extract as extract
     from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
     from pdhef_logtool.mapping import load_mapping as load_mapping
     from pdhef_logtool.records.errors import PdhefError as PdhefError
@@ -23,10 +21,11 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.querying import query as query
     from pdhef_logtool.runs.config import RunConfig as RunConfig
     from pdhef_logtool.runs.estimating import choose as choose
-    from pdhef_logtool.runs.fleet import Schedule as Schedule
-    from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
-    from pdhef_logtool.runs.frames import estimate as estimate
-    from pdhef_logtool.runs.frames import score as score
+    from pdhef_logtool.runs.fleet import (
+        Schedule as Schedule,
+        run_logs as run,  # noqa: F401
+    )
+    from pdhef_logtool.runs.frames import estimate as estimate, score as score
     from pdhef_logtool.runs.inspection.report import inspect_log as inspect_log
 
 #: Module of each public name, ``module`` or ``module:name in it``.

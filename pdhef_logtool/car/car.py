@@ -11,8 +11,7 @@ from pathlib import Path
 
 from pdhef_logtool.car.assumed_values import DEFAULT_CG_SPREAD, AssumedValue
 from pdhef_logtool.car.model import GROUND_TRUTH, CarModel, TaughtParameter, read_model
-from pdhef_logtool.car.names import MODEL_FILE
-from pdhef_logtool.car.names import SHIPPED_CARS as SHIPPED_CARS
+from pdhef_logtool.car.names import MODEL_FILE, SHIPPED_CARS as SHIPPED_CARS
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise, Fit, FittedPhysics, LearntOn, physics_sha256
 from pdhef_logtool.car.posterior import Posterior
 from pdhef_logtool.car.toml_files import VehicleFile, read_vehicle_file, with_sensors

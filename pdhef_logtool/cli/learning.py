@@ -34,8 +34,7 @@ def extract(
     resume: bool = False,
 ) -> None:
     """Write the residual dataset for train: the accelerations that the physics do not explain."""
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings
-    from pdhef_logtool.learning.network.extract_command import extract as write_residuals
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract as write_residuals
 
     settings = ExtractSettings(config, split=split, model=model, where=where)
     with console.reporter() as reporter:

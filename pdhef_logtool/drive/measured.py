@@ -27,8 +27,7 @@ from pdhef_logtool.drive.relations import (
 from pdhef_logtool.drive.truth import TruthTrack, channel_of, derive_truth
 from pdhef_logtool.mapping.candidates import UNIT_NOT_GIVEN
 from pdhef_logtool.mapping.naming import vector_of
-from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.mapping.records import Mapping as SignalMapping, SignalSource
 from pdhef_logtool.records.geometry import DEGREE_M
 from pdhef_logtool.records.signals import GNSS, GNSS_POSITION, WHEELS, Channel, FloatArray
 

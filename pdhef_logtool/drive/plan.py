@@ -4,8 +4,7 @@ In a car, mounting, delays, clocks and parameters are known from earlier drives 
 Offline they come from the log itself, so that estimates depend on later samples. With a model file they do not.
 """
 
-from collections.abc import Mapping as Mapped
-from collections.abc import Sequence
+from collections.abc import Mapping as Mapped, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

@@ -11,8 +11,7 @@ from pdhef_logtool.drive.checks import CHANGE_SUFFIX, change_checks
 from pdhef_logtool.drive.friction import FrictionFrom, FrictionSource, friction_source
 from pdhef_logtool.drive.options import AS_IT_IS, AUTO, OFF, ReadOptions, time_slice
 from pdhef_logtool.drive.plan import CLOCK_START_S, DrivePlan, Sensors, is_device_clock, plan_drive, with_earlier_drive
-from pdhef_logtool.drive.recorded import WholeDrive as WholeDrive
-from pdhef_logtool.drive.recorded import read_recorded
+from pdhef_logtool.drive.recorded import WholeDrive as WholeDrive, read_recorded
 from pdhef_logtool.logs.discovery import LogInput, Logs, check_unchanged, find_logs, identity_of, log_state
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log

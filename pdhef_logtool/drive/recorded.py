@@ -2,8 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection
-from collections.abc import Mapping as Mapped
+from collections.abc import Collection, Mapping as Mapped
 from dataclasses import dataclass, replace
 
 import numpy as np

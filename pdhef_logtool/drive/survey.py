@@ -6,8 +6,7 @@ order of their application does not matter.
 """
 
 import math
-from collections.abc import Collection, Iterator, Sequence
-from collections.abc import Mapping as Mapped
+from collections.abc import Collection, Iterator, Mapping as Mapped, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -50,8 +50,14 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 from pdhef_logtool.estimators.plug_ins import contained, package_of
-from pdhef_logtool.estimators.presets import AIDED, OPEN_LOOP, SELF_CALIBRATED, preset_of, uses_calibration
-from pdhef_logtool.estimators.presets import Options as Options
+from pdhef_logtool.estimators.presets import (
+    AIDED,
+    OPEN_LOOP,
+    SELF_CALIBRATED,
+    Options as Options,
+    preset_of,
+    uses_calibration,
+)
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.signals import has_gnss

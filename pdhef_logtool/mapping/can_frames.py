@@ -19,8 +19,7 @@ from pdhef_logtool.logs.drive_log import Columns, DriveLog, Requests, TopicInfo
 from pdhef_logtool.logs.message_schema import FieldInfo
 from pdhef_logtool.mapping.evidence import Pieces
 from pdhef_logtool.mapping.naming import VOCABULARY
-from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource, near
-from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, Mapping as SignalMapping, SignalSource, near
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 

@@ -1,8 +1,7 @@
 """Mapped fields into channels: SI values on the log's clock, cleaned, with every dropped sample counted."""
 
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
-from collections.abc import Mapping as Mapped
+from collections.abc import Collection, Iterable, Mapping as Mapped, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 

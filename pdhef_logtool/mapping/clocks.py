@@ -1,7 +1,6 @@
 """Convert stamps to the log's clock: offset and drift of device clocks, and plausibility of the transport delay."""
 
-from collections.abc import Iterable, Sequence
-from collections.abc import Mapping as Mapped
+from collections.abc import Iterable, Mapping as Mapped, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

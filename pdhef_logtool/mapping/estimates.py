@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES, factor_of
 from pdhef_logtool.mapping.recognition import COVARIANCES, SOURCES
-from pdhef_logtool.mapping.records import CanSettings, SignalSource, near
-from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.mapping.records import CanSettings, Mapping as SignalMapping, SignalSource, near
 from pdhef_logtool.mapping.vendors import plain_type
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS

@@ -1,7 +1,6 @@
 """mapping.toml: strict reading, and writing ready to edit (docs/formats.md#mappingtoml)."""
 
-from collections.abc import Collection, Sequence
-from collections.abc import Mapping as MappingABC
+from collections.abc import Collection, Mapping as MappingABC, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar

@@ -23,8 +23,7 @@ from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import check_mapping, mapping_of, read_signals, resolve_mapping
+from pdhef_logtool.mapping import Mapping as SignalMapping, check_mapping, mapping_of, read_signals, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, merge_losses, si_values
 from pdhef_logtool.mapping.choosing import mapping_for_recorder

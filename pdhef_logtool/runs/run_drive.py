@@ -21,8 +21,7 @@ from pdhef_logtool.evaluation.requirement_blocks import requirement_blocks
 from pdhef_logtool.evaluation.statistics import day_and_route
 from pdhef_logtool.evaluation.validation_plan import SIDESLIP, ValidationPlan
 from pdhef_logtool.logs.discovery import LogInput
-from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import merge_losses
+from pdhef_logtool.mapping import Mapping as SignalMapping, merge_losses
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.printable import printable
 from pdhef_logtool.records.processes import release_memory

@@ -13,8 +13,7 @@ from typing import Any
 from pdhef_logtool.evaluation.validation_plan import ValidationPlan
 from pdhef_logtool.logs.byte_source import ChangedError, SourceError
 from pdhef_logtool.logs.discovery import LogInput, identity_of
-from pdhef_logtool.mapping import Mapping as LogMapping
-from pdhef_logtool.mapping import mapping_of
+from pdhef_logtool.mapping import Mapping as LogMapping, mapping_of
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.reporter import Reporter
 from pdhef_logtool.results.no_position import without_names

@@ -15,8 +15,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.table_clocks import RELATIVE_NS
-from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import SignalSource, fit_clocks, read_signals
+from pdhef_logtool.mapping import Mapping as SignalMapping, SignalSource, fit_clocks, read_signals
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.signals import POSITIONS, Channel, FloatArray
 from pdhef_logtool.runs.inspection.report import inspect_drive_log

@@ -2,8 +2,7 @@ import unicodedata
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pdhef_logtool.logs.discovery import find_logs, folders_of
 from pdhef_logtool.records.errors import UsageError

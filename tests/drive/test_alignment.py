@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.alignment import AlignmentPlan, align, combine_wheel_speeds, plan_alignment

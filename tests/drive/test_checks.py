@@ -3,16 +3,14 @@
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
-from collections.abc import Mapping as Mapped
+from collections.abc import Iterator, Mapping as Mapped
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool import Car, RunConfig, inspect_log
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -237,16 +236,12 @@ def surveyed(wrong_log, mapping: Mapping, vehicle: VehicleParameters) -> Survey:
     return survey_log(wrong_log, mapping, clocks, (wrong_log.start_ns, wrong_log.end_ns))
 
 
-def inspected(wrong_log, mapping: Mapping, path: Path) -> Mapping:
-    write_mapping(inspect_drive_log(wrong_log, mapping if mapping.origin == "file" else None), path)
-    return load_mapping(path)
-
-
 @pytest.mark.parametrize("times", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_each_error_is_taken_off_once_however_often(wrong_log, tmp_path, times):
     mapping = auto_map(wrong_log).mapping
     for number in range(times):
-        mapping = inspected(wrong_log, mapping, tmp_path / f"{number}.toml")
+        write_mapping(inspect_drive_log(wrong_log, mapping if number else None), tmp_path / f"{number}.toml")
+        mapping = load_mapping(tmp_path / f"{number}.toml")
     plan = plan_drive(wrong_log, mapping, CAR, wrong_log.start_ns, wrong_log.end_ns)
     assert plan.mapping.signals["steer_rad"].scale == -1.0
     assert plan.mapping.signals["ay_m_s2"].field == "linear_acceleration.z"

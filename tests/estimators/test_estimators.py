@@ -7,8 +7,7 @@ from functools import cache, partial, reduce
 import numpy as np
 import pytest
 import test_estimators as properties
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from made_models import full_network, linear_residual, random_network
 from physics_oracle import vehicle
 from reference_car import drive, keep, on_axles, rolling_drive, rough_drive, slalom, with_noise

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference_car import FRONT_M, FRONT_TYRE, MASS_KG, REAR_M, REAR_TYRE, WHEELBASE_M, derivative, forces, on_axles
 
 from pdhef_logtool.car import nominal_model

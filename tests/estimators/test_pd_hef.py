@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from made_models import full_network, linear_residual, random_network
 from physics_oracle import G, Oracle, parts, vehicle
 from reference_car import FRICTION, Drive, drive, make_signals, slalom, with_noise

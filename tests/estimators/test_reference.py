@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference_car import FRONT_M, REAR_M, START_NS, Drive, drive, tanh_tyre, with_noise
 
 from pdhef_logtool.estimators import kinematic_filter as kinematics

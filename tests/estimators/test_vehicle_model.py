@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from physics_oracle import ALL_PARTS, Oracle, names_of, parts, vehicle
 from reference_car import FRICTION, on_axles
 

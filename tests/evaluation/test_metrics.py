@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.evaluation.dead_reckoned import lateral_errors, position_error
 from pdhef_logtool.evaluation.metrics import EvaluatedDrive, evaluate_drive

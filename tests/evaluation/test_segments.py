@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference_car import make_signals, signals_at
 
 from pdhef_logtool.car.toml_files import read_vehicle_file

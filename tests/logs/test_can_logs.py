@@ -11,8 +11,7 @@ from typing import Any
 import cantools
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool import ReadOptions, inspect_log, load_mapping
 from pdhef_logtool.logs.can_decoding import Decoder, Frames

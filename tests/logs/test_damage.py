@@ -7,6 +7,7 @@ import threading
 import zlib
 from collections.abc import Callable
 from contextlib import closing, suppress
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from mcap.writer import CompressionType, IndexType
 from recorded import T0, counts_of, numeric_paths, summary_of, write_imu, write_vectors
 
@@ -37,10 +37,6 @@ from tests.mcap_files import mcap_writer
 N = 400
 
 
-def _mcap(folder: Path) -> bytes:
-    return write_imu(folder / "good.mcap", np.arange(N) * 0.5, chunk=100).read_bytes()
-
-
 def _json_log(folder: Path, **options: Any) -> Path:
     path = folder / "log.mcap"
     with mcap_writer(path, chunk_size=2000, **options) as writer:
@@ -50,34 +46,18 @@ def _json_log(folder: Path, **options: Any) -> Path:
     return path
 
 
-def _mcap_of_another_writer(folder: Path) -> bytes:
-    return _json_log(folder, compression=CompressionType.LZ4).read_bytes()
-
-
-def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
-    return _json_log(folder, compression=CompressionType.ZSTD, index_types=IndexType.NONE).read_bytes()
-
-
-def _bag(folder: Path) -> bytes:
-    return write_vectors(folder / "good.bag", "/v", N, "bag", "LZ4").read_bytes()
-
-
-def _database(folder: Path) -> bytes:
-    return (write_vectors(folder / "bag", "/v", N) / "bag.db3").read_bytes()
-
-
-_SOURCES: dict[str, Callable[[Path], bytes]] = {
-    "mcap": _mcap,
-    "mcap-lz4": _mcap_of_another_writer,
-    "mcap-no-index": _mcap_of_a_killed_recorder,
-    "bag": _bag,
-    "sqlite3": _database,
+_SOURCES: dict[str, Callable[[Path], Path]] = {
+    "mcap": lambda folder: write_imu(folder / "good.mcap", np.arange(N) * 0.5, chunk=100),
+    "mcap-lz4": partial(_json_log, compression=CompressionType.LZ4),
+    "mcap-no-index": partial(_json_log, compression=CompressionType.ZSTD, index_types=IndexType.NONE),
+    "bag": lambda folder: write_vectors(folder / "good.bag", "/v", N, "bag", "LZ4"),
+    "sqlite3": lambda folder: write_vectors(folder / "bag", "/v", N) / "bag.db3",
 }
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    return {kind: make(tmp_path_factory.mktemp(kind)) for kind, make in _SOURCES.items()}
+    return {kind: make(tmp_path_factory.mktemp(kind)).read_bytes() for kind, make in _SOURCES.items()}
 
 
 def _read_everything(path: Path) -> tuple[int, bool]:

@@ -7,8 +7,7 @@ from contextlib import closing, nullcontext
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Block, ChannelRecord

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from hypothesis import assume, given, settings, strategies as st
 
 from pdhef_logtool.logs import table_clocks
 from pdhef_logtool.logs.table_clocks import NO_TIME, RELATIVE_NS, ascending_rows, week_clock

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from cantools.database.can import Message, Signal
 from cantools.database.conversion import BaseConversion
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.logs.can_decoding import signal_values
 from pdhef_logtool.logs.open_log import open_log

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.cli.inspecting import render_inspection
 from pdhef_logtool.logs.drive_log import Columns

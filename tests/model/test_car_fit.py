@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference_car import FRICTION, Drive, drive, keep, signals_at, slalom, with_noise
 
 from pdhef_logtool import Car, estimate, load_mapping, read_drive
@@ -31,8 +30,7 @@ from pdhef_logtool.estimators.table import all_names, make_estimator, spec_of
 from pdhef_logtool.estimators.vehicle_ukf import of_car, physics_filter
 from pdhef_logtool.evaluation.metrics.lateral_consistency import driven_consistency
 from pdhef_logtool.evaluation.metrics.metric import CalibratedSignals
-from pdhef_logtool.model import fit as rules
-from pdhef_logtool.model import intervals, priors
+from pdhef_logtool.model import fit as rules, intervals, priors
 from pdhef_logtool.model.drive_model import DriveModel
 from pdhef_logtool.model.driving import STEP_S, Driving, driving_of
 from pdhef_logtool.model.fit import fit_car

@@ -13,8 +13,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.results.parquet_sink import write_estimates as write_estimates_file
 from pdhef_logtool.results.run_report import LogOutcome
-from pdhef_logtool.results.tables import drive_part
-from pdhef_logtool.results.tables import write_tables as write_files
+from pdhef_logtool.results.tables import drive_part, write_tables as write_files
 from pdhef_logtool.storage.documents import seal
 
 START_NS = 1_700_000_000_000_000_000

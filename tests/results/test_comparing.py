@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.requirement_blocks import RequirementBlocks
-from pdhef_logtool.evaluation.requirement_verdicts import DriveValue, JudgedDrive, RequirementVerdict
-from pdhef_logtool.evaluation.requirement_verdicts import judge as judge_values
+from pdhef_logtool.evaluation.requirement_verdicts import (
+    DriveValue,
+    JudgedDrive,
+    RequirementVerdict,
+    judge as judge_values,
+)
 from pdhef_logtool.evaluation.validation_plan import ExposureNeed, Requirement, ValidationPlan, default_plan
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.results.comparing import Comparison, compare, compare_runs, figure, notes_of, sentence

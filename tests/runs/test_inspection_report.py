@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pdhef_logtool import Car, ReadOptions, read_drive
 from pdhef_logtool.cli.inspecting import render_inspection

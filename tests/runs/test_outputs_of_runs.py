@@ -26,8 +26,7 @@ from studies.torture.workers import Ended, command
 from tests.command_line import called
 from tests.failing_writes import failing_writes
 from tests.runs.stub_drives import stub_drive
-from tests.runs.test_fleet_runs import Counted, named_logs, run
-from tests.runs.test_fleet_runs import contents as without_journal
+from tests.runs.test_fleet_runs import Counted, contents as without_journal, named_logs, run
 
 #: Every command of a process writes the same files, however short the drive.
 SLICE = ("--start", "2", "--end", "4")

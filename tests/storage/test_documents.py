@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.toml_files import read_vehicle_file

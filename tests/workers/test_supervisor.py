@@ -12,8 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pdhef_logtool.records.errors import UsageError, WorkerError
 from pdhef_logtool.workers.ray_supervisor import supervise_on_ray

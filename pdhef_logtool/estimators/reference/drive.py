@@ -7,8 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.estimators import kinematic_filter as s
-from pdhef_logtool.estimators import rts
+from pdhef_logtool.estimators import kinematic_filter as s, rts
 from pdhef_logtool.estimators.prediction import sideslip_std
 from pdhef_logtool.estimators.reference.gnss import (
     first_guess,

@@ -22,6 +22,8 @@ To add a metric, write a file that exports ``METRICS`` (:class:`~.metric.Metric`
     )
 """
 
-from pdhef_logtool.evaluation.metrics.metric import EvaluatedDrive as EvaluatedDrive
-from pdhef_logtool.evaluation.metrics.metric import MetricRow as MetricRow
-from pdhef_logtool.evaluation.metrics.metric import evaluate_drive as evaluate_drive
+from pdhef_logtool.evaluation.metrics.metric import (
+    EvaluatedDrive as EvaluatedDrive,
+    MetricRow as MetricRow,
+    evaluate_drive as evaluate_drive,
+)

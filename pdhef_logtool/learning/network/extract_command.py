@@ -30,8 +30,7 @@ from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_cod
 from pdhef_logtool.learning.network import dataset, residuals
 from pdhef_logtool.learning.truth import TruthAt, teaching_reference
 from pdhef_logtool.logs.discovery import LogInput, Logs, as_taken, hash_log, identity_of, with_free_stem
-from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import mapping_of
+from pdhef_logtool.mapping import Mapping as SignalMapping, mapping_of
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.model.drive_model import DriveModel, read_driving
 from pdhef_logtool.model.fit import fit_car

@@ -2,8 +2,7 @@
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
-from collections.abc import Mapping as MappingABC
+from collections.abc import Callable, Iterable, Mapping as MappingABC, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
