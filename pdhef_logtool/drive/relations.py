@@ -268,7 +268,7 @@ def _steering(pace: _Pace, vehicle: VehicleParameters | None) -> Iterator[Relati
         either = [r for use in (pace.moving, gentle) for r in compare(by_rate, curvature, steer, use)]
         # Sliding front tyres break the relation at large angles, and noise breaks it at small ones.
         best = _best([replace(r, moves=r.correlation == 0.0 and is_turning) for r in either])  # dead sensor
-        if vehicle is not None and abs(best[0].correlation if best else 0.0) < LENGTHS["rolling"]:
+        if abs(best[0].correlation if best else 0.0) < LENGTHS["rolling"]:
             lengths = lengths[0] * LENGTHS["sliding"][0], lengths[1] * LENGTHS["sliding"][1]
         yield from (replace(r, law=replace(by_rate, gains=lengths)) for r in best)
         if "ay_m_s2" in columns:

@@ -301,9 +301,10 @@ def test_a_vehicle_file_decides_the_scale_of_the_steering(sample_logs_dir, tmp_p
         assert check.verdict == "failed" and f"multiply its scale in the mapping by {factor}" in check.remedy
 
 
-def test_sliding_on_ice_is_no_wrong_scale_of_the_steering(sample_logs_dir, tmp_path):
-    write_drive(simulate_drive("dlc-3888-2", friction=0.15, seed=11, keep_spins=True), log := tmp_path / "ice.mcap")
-    with read_drive(log, sample_logs_dir / "vehicle.toml") as drive:
+@pytest.mark.parametrize(("has_file", "friction", "seed"), [(True, 0.15, 11), (False, 0.25, 202)])
+def test_sliding_on_ice_is_no_wrong_scale_of_the_steering(sample_logs_dir, tmp_path, has_file, friction, seed):
+    write_drive(simulate_drive("dlc-3888-2", friction=friction, seed=seed, keep_spins=True), tmp_path / "ice.mcap")
+    with read_drive(tmp_path / "ice.mcap", sample_logs_dir / "vehicle.toml" if has_file else None) as drive:
         assert not [c.name for c in drive.plan.checks if c.verdict == "failed"]
 
 
