@@ -192,7 +192,9 @@ def _rows(
     @cache
     def known(first: str) -> _Place:
         finite = np.isfinite(columns.values[first][place])
-        return place if finite.all() else np.arange(len(columns.values[first]))[place][finite]
+        if finite.all():
+            return place
+        return np.flatnonzero(finite) if isinstance(place, slice) else place[finite]
 
     @cache
     def where_known(name: str, first: str) -> NDArray[Any]:
