@@ -114,14 +114,13 @@ def _finish(result: RunResult) -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
     else:
-        # Rows of tables are not printed: to make their texts printable takes longer than to print.
-        shown = tuple(replace(r, rows=(), part=None) for r in result.results)
+        # Only the report is printed; to make the texts of all rows printable takes as long as to print it.
+        shown = tuple(replace(r, document=r.report, rows=(), part=None) for r in result.results)
         console.show(replace(result, results=shown), render_run)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
-    plan = result.requirements
-    if plan is not None and plan.closing:
+    if (plan := result.requirements) is not None and plan.closing:
         for verdict in plan.closing:
             where = f"{verdict.requirement.id} ({verdict.requirement.label})"
             console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")

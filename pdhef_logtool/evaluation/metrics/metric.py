@@ -192,9 +192,7 @@ def _rows(
     @cache
     def known(first: str) -> _Place:
         finite = np.isfinite(columns.values[first][place])
-        if finite.all():
-            return place
-        return np.flatnonzero(finite) if isinstance(place, slice) else place[finite]
+        return place if finite.all() else np.arange(len(columns.values[first]))[place][finite]
 
     @cache
     def where_known(name: str, first: str) -> NDArray[Any]:
