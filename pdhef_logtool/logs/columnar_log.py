@@ -30,8 +30,8 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 from pdhef_logtool.storage.files import scratch_folder, write_bytes
 
 #: Loaded spans are kept up to this size, without payloads above ``_LARGE_BYTES`` (images, point clouds): the samples
-#: that recognition, clocks and inspection read, and all of a short log, are decompressed once.
-_KEPT_BYTES, _LARGE_BYTES = 48 * MIB, 16 * KIB
+#: that recognition reads, and all of a short log, are decompressed once.
+_KEPT_BYTES, _LARGE_BYTES = 16 * MIB, 16 * KIB
 #: A message in the text of a DBC file.
 _DBC = re.compile(r"^BO_ \d+ \w+ *:", re.MULTILINE)
 
