@@ -11,7 +11,6 @@ from pdhef_logtool.cli.console import BREAK, cell, protected, table
 from pdhef_logtool.cli.printing import print_template
 from pdhef_logtool.evaluation.metrics.metric import registered
 from pdhef_logtool.evaluation.units import LABELS, read_unit
-from pdhef_logtool.records.printable import all_printable
 from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.results.selected_estimate import assumptions_of, figures_of
 from pdhef_logtool.runs.run_result import RunResult
@@ -33,7 +32,7 @@ _LEAVE_LAST = """
 
 def render_run(result: RunResult, console: Console) -> None:
     """Print the selected estimate of each log, or one table for several logs, and the location of the outputs."""
-    logs = [(r.outcome, all_printable(r.report)) for r in result.results]
+    logs = [(r.outcome, r.report) for r in result.results]
     reports = [report for _, report in logs if report is not None]
     first, *others = [assumptions_of(report) for report in reports] or [[]]
     assumed = [clause for clause in first if all(clause in clauses for clauses in others)]

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -111,12 +112,13 @@ def _finish(result: "RunResult") -> NoReturn:
         summary = summarise(open_run(result.output), result.exit_code) | {"output": str(result.place)}
         console.show(summary, render_fleet)
     else:
-        console.show(result, render_run)
+        # Only the report is printed; to make the texts of all rows printable takes as long as to print it.
+        shown = tuple(replace(r, document=r.report, rows=(), part=None) for r in result.results)
+        console.show(replace(result, results=shown), render_run)
         for entry in result.results:
             if entry.outcome.failed is not None and entry.report is not None:  # the tables show the others
                 console.error(f"pdhef: {entry.outcome.log}: {entry.outcome.failed}")
-    plan = result.requirements
-    if plan is not None and plan.closing:
+    if (plan := result.requirements) is not None and plan.closing:
         for verdict in plan.closing:
             where = f"{verdict.requirement.id} ({verdict.requirement.label})"
             console.error(f"pdhef: {verdict.outcome}: {where}: {verdict.reason}")
