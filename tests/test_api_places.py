@@ -1,6 +1,7 @@
 """Every file, folder and log that the Python API takes may be a text instead of a path; one log is a list of one."""
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +52,6 @@ def test_run(dlc, mapping, sample_logs_dir, tmp_path):
     assert (tmp_path / "j.xml").is_file()
 
 
-def _settings(name: str, config: pdhef.RunConfig) -> Any:
-    return (pdhef.LearnSettings if name == "learn" else pdhef.ExtractSettings)(config=config)
-
-
 def _ends(call: Callable[[], Any]) -> str:
     """Return the error message of a command on a missing log."""
     with pytest.raises(pdhef.PdhefError) as ended:
@@ -66,7 +63,7 @@ def _ends(call: Callable[[], Any]) -> str:
 def test_what_learns_takes_texts_and_paths(kind, tmp_path):
     log, out = tmp_path / "none.mcap", kind(tmp_path / "out")
     config = pdhef.RunConfig(car=kind("saloon"), network=kind("none"))
-    for name in ("learn", "extract"):
+    for call, settings in ((pdhef.learn, pdhef.LearnSettings), (pdhef.extract, pdhef.ExtractSettings)):
         for logs in (kind(log), [kind(log)]):
-            assert "no such file" in _ends(lambda: getattr(pdhef, name)(logs, out, _settings(name, config))).lower()  # noqa: B023
+            assert "no such file" in _ends(partial(call, logs, out, settings(config=config))).lower()
     assert "manifest.json" in _ends(lambda: pdhef.train(kind(tmp_path / "set"), out, init=kind(tmp_path / "net")))

@@ -215,13 +215,13 @@ def _moving(columns: Mapping[str, FloatArray], speed: FloatArray) -> BoolArray:
 
 def _lengths(pace: _Pace, vehicle: VehicleParameters | None) -> dict[str, tuple[float, float]]:
     """Return the plausible effective wheelbases by road-wheel and by steering-wheel angle, m."""
-    columns, speed = pace.columns, pace.speed
+    columns = pace.columns
+    speeds = [np.abs(c[np.isfinite(c)]) for c in (pace.speed, columns.get("truth.vx_m_s")) if c is not None]
     if vehicle is None:
-        finite = np.abs(speed[np.isfinite(speed)])
-        is_full_size = finite.size and FULL_SIZE_M_S[0] < np.quantile(finite, HIGH) < FULL_SIZE_M_S[1]
+        is_full_size = all(c.size and FULL_SIZE_M_S[0] < np.quantile(c, HIGH) < FULL_SIZE_M_S[1] for c in speeds)
         lengths = LENGTHS["full_size"] if is_full_size else LENGTHS
         return {name: tuple(lengths[name]) for name in _STEERING}
-    paces = [median_known(np.abs(c)) for c in (speed, columns.get("truth.vx_m_s")) if c is not None]
+    paces = [median_known(c) for c in speeds]
     if "ay_m_s2" in columns:
         ay, rate = (columns[n] for n in ("ay_m_s2", "yaw_rate_rad_s"))
         finite = np.isfinite(ay) & np.isfinite(rate)

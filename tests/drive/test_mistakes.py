@@ -209,9 +209,8 @@ def test_exchanged_degrees_of_a_place_are_named_as_such():
 def test_components_of_one_vector_have_one_unit(fields, scale, is_named):
     """Nothing else shows the unit of a lateral velocity without a gyro and an accelerometer."""
     signals, truth = with_truth(VEHICLE, scale)
-    signals, truth = (
-        {n: its[n] for n in names} for its, names in ((signals, ["speed_m_s"]), (truth, ["vx_m_s", "vy_m_s"]))
-    )
+    signals = {"speed_m_s": signals["speed_m_s"]}
+    del truth["yaw_rate_rad_s"]
     sources = zip(truth, fields, (1.0, scale), strict=True)
     mapping = Mapping({}, {n: SignalSource(n, "/truth", field, scale=s) for n, field, s in sources})
     checks = check_drive(measure(signals, truth, derive_truth(truth), VEHICLE, mapping))
@@ -299,6 +298,17 @@ def test_a_vehicle_file_decides_the_scale_of_the_steering(sample_logs_dir, tmp_p
     with read_drive(path, sample_logs_dir / "vehicle.toml", wrong) as drive:
         (check,) = (c for c in drive.plan.checks if c.name == "steer_rad.unit")
         assert check.verdict == "failed" and f"multiply its scale in the mapping by {factor}" in check.remedy
+
+
+def test_a_model_car_with_a_wrong_speed_is_no_full_size_car():
+    signals, truth = (
+        {n: c if n.startswith(("yaw", "steer")) else replace(c, values=0.1 * c.values) for n, c in its.items()}
+        for its in with_truth(VEHICLE, 1.0)
+    )
+    signals = {n: c for n, c in signals.items() if not n.startswith("wheel")}
+    fast = signals | {"speed_m_s": replace(signals["speed_m_s"], values=9.80665 * signals["speed_m_s"].values)}
+    (wrong,) = (c for c in checks_of(fast, truth, derive_truth(truth)) if c.verdict == "failed")
+    assert wrong.name == "speed_m_s.unit" and "by 0.101972" in wrong.remedy
 
 
 @pytest.mark.parametrize(("has_file", "friction", "seed"), [(True, 0.15, 11), (False, 0.25, 202)])

@@ -409,10 +409,7 @@ def many_rows() -> bytes:
     return mdf4([clock, Ch("n", kind=6, bits=0, data_type=0)], b"", 2**40, 0)
 
 
-def many_channels() -> bytes:
-    return mdf4([TIME, *(Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves))], bytes(16), 1, 16)
-
-
+MANY = [Ch(f"c{i}", 8) for i in range(DEFAULT_LIMITS.schema_leaves)]
 FAR_BIT, OUTSIDE = [TIME, Ch("AccY", 8, flags=2, invalid_bit=2**20)], "AccY is outside of its record"
 HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
     **{
@@ -423,7 +420,7 @@ HARMFUL: dict[str, tuple[Callable[[], bytes], str]] = {
     "data of a frame": (far_data, "data of a frame are missing"),
     "packed": (lambda: imu(packed=(2**40,)), "table bytes"),
     "rows": (many_rows, "table bytes"),
-    "channels": (many_channels, "schema leaves"),
+    "channels": (partial(mdf4, [TIME, *MANY], bytes(16), 1, 16), "schema leaves"),
     "bit of invalid samples": (partial(mdf4, FAR_BIT, bytes(17 * N), N, 16, invalid_bytes=1), OUTSIDE),
     **{f"offset {of}": (partial(imu, offset=of), f"with times.*{OUTSIDE}") for of in (1000, 2**31, 12)},
 }

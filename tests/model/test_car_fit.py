@@ -163,11 +163,8 @@ def test_what_straight_driving_does_not_excite_keeps_its_prior():
 
 def test_a_right_file_decides_what_gentle_driving_cannot_and_a_wrong_one_does_not():
     signals = with_noise(drive(sweep(0.001), 20.0).signals, 3)
-
-    def level_error(file: VehicleParameters) -> float:
-        return abs(stiffness_errors(found(signals, file))[0][0])
-
-    right, wrong_level, without_file = (level_error(file) for file in (wrong(1.001, 1.001), wrong(2.0, 0.5), RIGHT))
+    files = wrong(1.001, 1.001), wrong(2.0, 0.5), RIGHT
+    right, wrong_level, without_file = (abs(stiffness_errors(found(signals, file))[0][0]) for file in files)
     assert right < 0.7 * without_file
     assert wrong_level < 0.7 * math.log(2.0)
 

@@ -157,15 +157,11 @@ def test_metrics_record_and_report_attachment(annotated):
     assert json.loads(report.data) == REPORT
 
 
-def cdr_only(path: Path, source: Path) -> None:
-    """Copy the CDR topics, as rosbags opens no file with other encodings."""
-    mcap_logs.write_log(path, (m for m in mcap_logs.messages(source) if m.encoding == "cdr"), "ros2")
-
-
 @pytest.fixture
 def ros_only(tmp_path, source, tracks):
     drive, path = tmp_path / "ros.mcap", tmp_path / "ros_annotated.mcap"
-    cdr_only(drive, source)
+    # rosbags opens no file with other encodings.
+    mcap_logs.write_log(drive, (m for m in mcap_logs.messages(source) if m.encoding == "cdr"), "ros2")
     annotate(path, drive, tracks)
     return path
 

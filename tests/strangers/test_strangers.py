@@ -24,10 +24,6 @@ _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
 
 
-def _channel(values: np.ndarray, shift_ns: int = 0) -> Channel:
-    return Channel("yaw_rate_rad_s", "rad/s", "/a.b", _NS + shift_ns, _NS + shift_ns, values)
-
-
 @pytest.mark.parametrize(
     ("values", "shift_ns", "right"),
     [
@@ -45,7 +41,8 @@ def _channel(values: np.ndarray, shift_ns: int = 0) -> Channel:
     ],
 )
 def test_values_decide_whether_a_channel_is_right(values, shift_ns, right):
-    channel = _channel(values, shift_ns) if values.size else Channel("a", "1", "", _NS[:0], _NS[:0], values)
+    stamps_ns = _NS[: values.size] + shift_ns
+    channel = Channel("yaw_rate_rad_s", "rad/s", "/a.b", stamps_ns, stamps_ns, values)
     assert agrees(channel, Series(_NS, _NS, _WAVE), "yaw_rate_rad_s") is right
 
 
