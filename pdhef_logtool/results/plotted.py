@@ -13,7 +13,7 @@ from pdhef_logtool.evaluation.track_errors import NORMAL_95, signal_error
 from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import NS_PER_S, FloatArray
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import REFERENCE, StateTrack
 from pdhef_logtool.results.run_report import lines_of
 from pdhef_logtool.results.sink import Event
 
@@ -93,9 +93,8 @@ def plotted_fields(track: StateTrack, truth: StateTrack | None, min_speed_m_s: f
     return fields | {plot.error: of_track[plot.name] for plot in ERRORS}
 
 
-_TRUTH = 0x8A8A8A
-#: The sideslip reference.
-REFERENCE_COLOUR = 0x999933
+#: Of ground truth, and of the sideslip reference, which no estimator has.
+_NO_ESTIMATORS = {"truth": 0x8A8A8A, REFERENCE: 0xBBCC33}
 #: For other names, such as recorded estimates: Okabe and Ito (2008) without black and yellow.
 _OTHERS = (0xD55E00, 0x0072B2, 0xE69F00, 0x009E73, 0xCC79A7, 0x56B4E9)
 
@@ -105,7 +104,7 @@ def colour_rgb(name: str, colours: Mapping[str, int]) -> tuple[int, int, int]:
 
     A name that is not there always gets the same colour of the palette.
     """
-    packed = {"truth": _TRUTH, **colours}.get(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)])
+    packed = {**_NO_ESTIMATORS, **colours}.get(name, _OTHERS[zlib.crc32(name.encode()) % len(_OTHERS)])
     red, green, blue = packed.to_bytes(3)
     return red, green, blue
 

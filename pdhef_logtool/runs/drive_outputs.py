@@ -17,11 +17,10 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.signals import NS_PER_S
-from pdhef_logtool.records.tracks import REFERENCE, StateTrack
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.results import opened_run
 from pdhef_logtool.results.no_position import topics_with_position, without_pose
 from pdhef_logtool.results.parquet_sink import write_estimates
-from pdhef_logtool.results.plotted import REFERENCE_COLOUR
 from pdhef_logtool.results.run_report import build_run, tool_versions, write_json
 from pdhef_logtool.results.sink import TRUTH, Event
 from pdhef_logtool.results.tables import add_verdicts, write_metrics, write_tables
@@ -107,7 +106,7 @@ class DriveOutputs:
     def write(self, report: dict[str, Any], rows: Sequence[MetricRow], events: Sequence[Event]) -> None:
         """Write all files but the annotated log."""
         config, drive = self._run.config, self._run.drive
-        colours = {REFERENCE: REFERENCE_COLOUR, **{s.name: s.colour for s in all_specs()}}
+        colours = {s.name: s.colour for s in all_specs()}
         if config.annotation != "none":
             self._write_layouts(colours)
         if config.kept == "full":
