@@ -379,9 +379,10 @@ def _poses(columns: Mapping[str, FloatArray]) -> list[Relation]:
     applies to some of the yaw rates only, the sign is unknown.
     """
     subject = next((n for n, of in (("truth.sideslip_rad",) * 2, ("truth.vy_m_s", CG_VY)) if of in columns), "")
-    if not {subject, "truth.pose_vy_m_s"} <= columns.keys():
+    of_pose = [f"truth.{n}" for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s")]
+    if not {subject, *of_pose} <= columns.keys():  # a damaged one may have no values
         return []
-    ahead, left, turning = (columns[f"truth.{n}"] for n in ("pose_vx_m_s", "pose_vy_m_s", "heading_rate_rad_s"))
+    ahead, left, turning = (columns[n] for n in of_pose)
     moving = moving_at(ahead)
     speed = np.where(moving, np.hypot(ahead, left), np.nan)
     if median_known(ahead / speed) < AHEAD_SHARE:

@@ -372,13 +372,13 @@ class ColumnarLog(DriveLog):
         is_inside = bool(keep.all())
         # By the channels of the block: the counts of the span can be from a wrong index.
         for id_, rows in block.rows.items():
-            topic = channels[id_].topic if id_ in channels else ""
-            if topic not in plans:
+            channel = self._channels.get((c, id_))  # reading may show further channels
+            if channel is None or channel.record.topic not in plans:
                 continue
             if self.recording_span.left_out:
                 rows = rows[self.recording_span.used((c, span.index, id_), block.log_time_ns[rows])]
             rows = rows if is_inside else rows[keep[rows]]
-            columns = self._decode(plans[topic], self._channels[c, id_], span, block, rows) if rows.size else None
+            columns = self._decode(plans[channel.record.topic], channel, span, block, rows) if rows.size else None
             if columns is not None:
                 yield columns
 

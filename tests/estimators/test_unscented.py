@@ -67,16 +67,12 @@ def test_the_root_after_an_update_that_rounds_to_zero_is_definite():
     np.testing.assert_allclose(L @ L.T, P, atol=1e-4)
 
 
-def _spd(rng, n):
-    root = rng.standard_normal((n, n))
-    return root @ root.T + 0.1 * np.eye(n)
-
-
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), steps=st.integers(1, 8), restart=st.booleans())
 def test_smoothed_states_are_those_of_dense_least_squares(seed, n, steps, restart):
     rng = np.random.default_rng(seed)
-    transitions, noises = rng.standard_normal((steps, n, n)), np.array([_spd(rng, n) for _ in range(steps)])
+    transitions, roots = rng.standard_normal((2, steps, n, n))
+    noises = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(n)
     jacobians, stds = rng.standard_normal((steps, n)), rng.uniform(0.3, 1.4, steps)
     measured, offsets = rng.standard_normal(steps), rng.standard_normal((steps, n))
     transitions[[0, *([steps // 2] if restart else [])]] = 0.0  # these states do not depend on the one before

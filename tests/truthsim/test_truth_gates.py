@@ -221,11 +221,6 @@ def a_banked_bend_presses(simulate: Simulate, car: Vehicle) -> None:
     near(mean["gyro_y_rad_s"], heading_rate * np.sin(roll) * np.cos(pitch), rel=0.02)
 
 
-def rolling_mass() -> float:
-    """Return the mass plus the equivalent mass of the rotating wheels."""
-    return M + 2.0 * (1.6 + 1.2) / RADIUS**2
-
-
 def resistance_n(speed: float) -> float:
     return 0.5 * 1.204 * 0.66 * speed**2 + 0.012 * M * G
 
@@ -242,7 +237,8 @@ def pushed(simulate: Simulate, car: Vehicle, speed: float, torque: float, grade:
 def slowing_n(motion: Motion) -> tuple[float, float]:
     """Force that slows the rolling mass over the last two seconds, N, and the mean speed."""
     v = motion.column("vx_m_s")
-    return float(rolling_mass() * (v[100] - v[-1]) / 2.0), float(v[100:].mean())
+    rolling_mass = M + 2.0 * (1.6 + 1.2) / RADIUS**2  # with the rotating wheels
+    return float(rolling_mass * (v[100] - v[-1]) / 2.0), float(v[100:].mean())
 
 
 def a_hill_pulls(simulate: Simulate, car: Vehicle) -> None:
