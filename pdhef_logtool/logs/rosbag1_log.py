@@ -62,10 +62,10 @@ class Rosbag1Container(FileContainer):
             record = _record_at(self.source.read, offset, size, self.meter.limits.metadata_bytes)
             if record is None:
                 index_at = self._header[0] if self._header else 0
-                padded_to = index_at if offset < index_at <= size else size
+                end = index_at if offset < index_at <= size else size
                 # Some writers pad with zeros behind the last chunk or the last record.
-                if not any(any(self.source.read(at, min(MIB, padded_to - at))) for at in range(offset, padded_to, MIB)):
-                    self.position = padded_to
+                if not any(any(self.source.read(start, min(MIB, end - start))) for start in range(offset, end, MIB)):
+                    self.position = end
                     continue
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")

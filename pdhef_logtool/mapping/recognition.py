@@ -665,8 +665,8 @@ def _map_truth_position(draft: _Draft, candidates: list[TopicInfo], velocity: To
     draft.take(draft.truth, chosen, "x_m", "y_m")
     parts = [draft.values(chosen, "quat_wxyz", column) for column in range(4)] if draft.has(chosen, "quat_wxyz") else []
     # Damaged messages may lack some components; without values, the log's own definition decides.
-    known = min(map(len, parts), default=0)
-    norms = np.linalg.norm([part[:known] for part in parts], axis=0) if parts else np.zeros(1)
+    shortest = min(map(len, parts), default=0)
+    norms = np.linalg.norm([part[:shortest] for part in parts], axis=0) if parts else np.zeros(1)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < NEAR_UNIT)):
         draft.take(draft.truth, chosen, "quat_wxyz")
 
