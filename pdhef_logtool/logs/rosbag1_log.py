@@ -62,10 +62,9 @@ class Rosbag1Container(FileContainer):
             record = _record_at(self.source.read, offset, size, self.meter.limits.metadata_bytes)
             if record is None:
                 index_at = self._header[0] if self._header else 0
-                end = index_at if offset < index_at <= size else size
-                # Some writers pad with zeros behind the last chunk or the last record.
-                if not any(any(self.source.read(start, min(MIB, end - start))) for start in range(offset, end, MIB)):
-                    self.position = end
+                padded_to = index_at if offset < index_at <= size else size
+                if self._is_zero(offset, padded_to):
+                    self.position = padded_to  # some writers pad with zeros behind the last chunk or the last record
                     continue
                 if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
@@ -126,6 +125,9 @@ class Rosbag1Container(FileContainer):
             self.add_span(chunk, span)
         else:
             self.add_content(chunk)
+
+    def _is_zero(self, start: int, end: int) -> bool:
+        return all(not any(self.source.read(offset, min(MIB, end - offset))) for offset in range(start, end, MIB))
 
     def _add_connection(self, fields: Header, payload: bytes) -> None:
         inner = Header.read(BytesIO(_U32.pack(len(payload)) + payload))

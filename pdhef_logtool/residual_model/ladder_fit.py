@@ -153,7 +153,7 @@ def fit_ladder(drives: Sequence[TaughtDrive], *, rungs: Sequence[str] = (LINEAR,
     if not samples or seconds < 2.0 * LEAST_BLOCK_S:
         return LadderFit(None, (), seconds, 0)
     odd, even = (np.concatenate([getattr(s.drive.features, n)[s.rows] for s in samples]) for n in ("odd", "even"))
-    scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), LEAST_DIVISOR)
+    scale = np.maximum(np.sqrt(np.mean(odd**2, axis=0)), 1e-9)
     even_mean, even_scale = even.mean(axis=0), np.maximum(even.std(axis=0), 1e-3)
     count = RANDOM_FEATURES if RANDOM in rungs and seconds >= RANDOM_LEAST_S else 0
     rng = np.random.default_rng(0)
